@@ -33,8 +33,7 @@ PYTEST = $(BIN)/python -m pytest --hasty -n $(WORKERS) --dist worksteal
 RANDOM = -p randomly --randomly-seed=$(SEED) --randomly-dont-reset-seed
 
 # Tests that compile networks take nearly all of the time.
-SLOW = parity network method pipeline training calibration learning commands benchmarks pretrained windows test_docs.py \
-  app proofs known test_packaging.py
+SLOW = parity network method pipeline training research interface benchmarks test_docs.py proofs test_packaging.py
 
 # Processes of the tests read compiled Python files rather than compile them anew, whatever the shell says.
 export PYTHONDONTWRITEBYTECODE :=

@@ -15,22 +15,22 @@ from rich.console import Console
 from rich.table import Table
 
 from vggtjax.cameras import unproject
-from vggtjax.checkpoint import Model
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
-from vggtjax.evaluation.metrics.depth import median_scale
-from vggtjax.evaluation.metrics.trajectory import centre_error, rotation_error
 from vggtjax.network.aggregator import GLOBAL_ATTENTION, SPECIAL_TOKENS
 from vggtjax.network.block import Block, apply_block
+from vggtjax.network.checkpoint import Model
+from vggtjax.network.heads.pose import decode_pose
+from vggtjax.network.kernels.quantised import is_quantised, quantise
 from vggtjax.network.layers import Params
 from vggtjax.network.model import forward
-from vggtjax.network.pose import decode_pose
 from vggtjax.network.precision import full_precision
-from vggtjax.network.quantised import is_quantised, quantise
 from vggtjax.network.rope import rope_table
-from vggtjax.pretrained.load import load_model
-from vggtjax.scenes import SceneConfig, held_out_scenes
+from vggtjax.pipeline.pretrained.load import load_model
+from vggtjax.research.evaluation.metrics.depth import median_scale
+from vggtjax.research.evaluation.metrics.trajectory import centre_error, rotation_error
 from vggtjax.storage.kept_memory import keep_freed_memory
+from vggtjax.training.scenes import SceneConfig, held_out_scenes
 
 WAYS: dict[str, str] = {
     "exact": "exact",

@@ -14,12 +14,12 @@ from scipy.spatial.transform import Rotation
 
 from vggtjax.clips.truth import Truth
 from vggtjax.errors import InputError
-from vggtjax.evaluation.ladder import LadderRow
-from vggtjax.evaluation.metrics.depth import depth_errors, measured
-from vggtjax.evaluation.metrics.trajectory import from_first, rotation_error
-from vggtjax.geometry.similarity import centres
 from vggtjax.progress import Progress
-from vggtjax.scenes import SceneConfig, generate, load_textures
+from vggtjax.research.evaluation.ladder import LadderRow
+from vggtjax.research.evaluation.metrics.depth import depth_errors, measured
+from vggtjax.research.evaluation.metrics.trajectory import from_first, rotation_error
+from vggtjax.similarity import centres
+from vggtjax.training.scenes import SceneConfig, generate, load_textures
 
 
 class Prior(NamedTuple):

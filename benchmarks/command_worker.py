@@ -37,7 +37,7 @@ def run_command(words: list[str], cache: Path, devices: int = 1) -> dict[str, An
 
 def main(words: list[str]) -> None:
     """Run the command, and print what it took."""
-    from vggtjax.commands.main import main as run
+    from vggtjax.interface.commands.main import main as run
 
     began = time.perf_counter()
     with PeakMemory() as peak:

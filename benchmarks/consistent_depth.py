@@ -18,17 +18,17 @@ from vggtjax.cameras import world_from_camera
 from vggtjax.clips.clip import load_clip
 from vggtjax.clips.truth import Truth, at_clip_pixels, batched_truth, intrinsics_at_clip_pixels
 from vggtjax.errors import InputError, check_extra
-from vggtjax.evaluation.metrics.depth import depth_errors, measured, median_scale
-from vggtjax.evaluation.metrics.trajectory import rotation_error, trajectory_errors
 from vggtjax.options import MethodName
-from vggtjax.pretrained.load import load_model
-from vggtjax.reconstruction import Reconstruction
-from vggtjax.refinement.consistent import consistent_depth as make_consistent
-from vggtjax.refinement.joining import differences
-from vggtjax.refinement.refine import refine_with_points
-from vggtjax.scenes import SceneConfig, held_out_scenes
-from vggtjax.scenes.held_out import Kind
+from vggtjax.pipeline.pretrained.load import load_model
+from vggtjax.pipeline.refinement.consistent import consistent_depth as make_consistent
+from vggtjax.pipeline.refinement.joining import differences
+from vggtjax.pipeline.refinement.refine import refine_with_points
+from vggtjax.research.evaluation.metrics.depth import depth_errors, measured, median_scale
+from vggtjax.research.evaluation.metrics.trajectory import rotation_error, trajectory_errors
+from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.storage.writing import staging, writing
+from vggtjax.training.scenes import SceneConfig, held_out_scenes
+from vggtjax.training.scenes.held_out import Kind
 
 METRICS = {
     "abs_rel": "AbsRel", "static": "AbsRel static", "layers": "layers", "rotation": "rotation (deg)",

@@ -24,14 +24,14 @@ from benchmarks.summaries import (
     saliency_auc,
     summarise,
 )
-from vggtjax.checkpoint import Model
 from vggtjax.clips.truth import Truth, batched_truth
 from vggtjax.errors import InputError, check_extra
-from vggtjax.evaluation.ladder import LadderRow, MaskSource, ladder
-from vggtjax.pretrained.load import load_model
+from vggtjax.network.checkpoint import Model
+from vggtjax.pipeline.pretrained.load import load_model
 from vggtjax.progress import Progress
-from vggtjax.scenes import SceneConfig, held_out_scenes
+from vggtjax.research.evaluation.ladder import LadderRow, MaskSource, ladder
 from vggtjax.storage.writing import staging, writing
+from vggtjax.training.scenes import SceneConfig, held_out_scenes
 
 CLIPS = Path(__file__).parents[2] / "shared" / "clips"
 SUPPRESS = ("zero", "drop")

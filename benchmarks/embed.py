@@ -10,16 +10,24 @@ import numpy as np
 from rich.console import Console
 from scipy.stats import rankdata
 
-from vggtjax.checkpoint import Model, numpy_dtype, save_model
 from vggtjax.clips.truth import Truth
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
-from vggtjax.evaluation.ladder import ladder
 from vggtjax.network.backbone import patch_positions
+from vggtjax.network.checkpoint import Model, numpy_dtype, save_model
 from vggtjax.network.layers import Params
-from vggtjax.pretrained.embedded import CLIP, MODEL, NOTE, SCENE_SEED, UNTRAINED_HEADS, demo_model, write_demo_clip
-from vggtjax.pretrained.load import load_model
-from vggtjax.scenes import SceneConfig, held_out_scenes
+from vggtjax.pipeline.pretrained.embedded import (
+    CLIP,
+    MODEL,
+    NOTE,
+    SCENE_SEED,
+    UNTRAINED_HEADS,
+    demo_model,
+    write_demo_clip,
+)
+from vggtjax.pipeline.pretrained.load import load_model
+from vggtjax.research.evaluation.ladder import ladder
+from vggtjax.training.scenes import SceneConfig, held_out_scenes
 
 MOST_MODEL_BYTES = 24 << 20
 MOST_CLIP_BYTES = 1 << 20

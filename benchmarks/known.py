@@ -18,14 +18,14 @@ from benchmarks.known_clips import KnownClip, clips_of_seed
 from benchmarks.summaries import markdown_table, spread
 from vggtjax.cameras import unproject, world_from_camera
 from vggtjax.errors import InputError
-from vggtjax.evaluation.metrics.depth import depth_errors
-from vggtjax.evaluation.metrics.trajectory import centre_error, rotation_error, umeyama_sim3
-from vggtjax.known.apply import apply_known
-from vggtjax.known.depths import DepthSamples
-from vggtjax.known.given import Given
-from vggtjax.known.options import Baseline, KnownGeometry
-from vggtjax.pretrained.load import load_model
-from vggtjax.reconstruction import Reconstruction
+from vggtjax.pipeline.known.apply import apply_known
+from vggtjax.pipeline.known.depths import DepthSamples
+from vggtjax.pipeline.known.given import Given
+from vggtjax.pipeline.known.options import Baseline, KnownGeometry
+from vggtjax.pipeline.pretrained.load import load_model
+from vggtjax.research.evaluation.metrics.depth import depth_errors
+from vggtjax.research.evaluation.metrics.trajectory import centre_error, rotation_error, umeyama_sim3
+from vggtjax.results.reconstruction import Reconstruction
 
 _EVERY = 7  # pixels of a clip, for the points
 _DEPTHS = 5  # known ones, in frame 0

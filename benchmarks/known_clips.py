@@ -9,14 +9,14 @@ from typing import NamedTuple, get_args
 
 import numpy as np
 
-from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import load_clip
+from vggtjax.network.checkpoint import Model
 from vggtjax.pipeline.run import reconstruct
-from vggtjax.reconstruction import Reconstruction
+from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.result import FieldOfViewWarning
-from vggtjax.scenes import SceneConfig, held_out_scenes
-from vggtjax.scenes.held_out import Kind
 from vggtjax.storage.writing import writing
+from vggtjax.training.scenes import SceneConfig, held_out_scenes
+from vggtjax.training.scenes.held_out import Kind
 
 FRAMES = 12
 

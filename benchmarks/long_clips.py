@@ -17,23 +17,23 @@ from rich.table import Table
 
 from benchmarks.command_worker import run_command
 from benchmarks.plots import plot_paths
-from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import load_clip
+from vggtjax.clips.media.sampling import Sampling
 from vggtjax.clips.preprocessing import Fitter
 from vggtjax.clips.sources import open_source
 from vggtjax.errors import InputError
-from vggtjax.evaluation.metrics.trajectory import centre_error, rotation_error
-from vggtjax.geometry.similarity import centres, umeyama_sim3
-from vggtjax.media.sampling import Sampling
+from vggtjax.network.checkpoint import Model
+from vggtjax.pipeline.pretrained.load import load_model
 from vggtjax.pipeline.run import reconstruct
-from vggtjax.pretrained.load import load_model
-from vggtjax.scenes import SceneConfig, SyntheticClip, closed_walk, load_textures, render, sample_scene
-from vggtjax.windows.frames import window_clips
-from vggtjax.windows.join import JoinRule
-from vggtjax.windows.plan import plan_windows
-from vggtjax.windows.run import tools_of
-from vggtjax.windows.store import WindowStore
-from vggtjax.windows.whole import Whole, store_window
+from vggtjax.pipeline.windows.frames import window_clips
+from vggtjax.pipeline.windows.join import JoinRule
+from vggtjax.pipeline.windows.plan import plan_windows
+from vggtjax.pipeline.windows.run import tools_of
+from vggtjax.pipeline.windows.store import WindowStore
+from vggtjax.pipeline.windows.whole import Whole, store_window
+from vggtjax.research.evaluation.metrics.trajectory import centre_error, rotation_error
+from vggtjax.similarity import centres, umeyama_sim3
+from vggtjax.training.scenes import SceneConfig, SyntheticClip, closed_walk, load_textures, render, sample_scene
 
 Kind = Literal["static", "dynamic"]
 _STREAM = 0x77616C6B  # folded into the key, so that no other use of a seed draws these walks

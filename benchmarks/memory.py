@@ -16,11 +16,11 @@ from rich.table import Table
 
 from benchmarks.command_worker import run_command
 from benchmarks.suite.report import console
-from testing.seeded import seeded_images
-from vggtjax.checkpoint import Model
+from tests.shared.seeded import seeded_images
 from vggtjax.errors import InputError
+from vggtjax.network.checkpoint import Model
 from vggtjax.pipeline.memory import predicted_bytes
-from vggtjax.pretrained.load import load_model
+from vggtjax.pipeline.pretrained.load import load_model
 from vggtjax.storage.writing import writing
 
 WITHIN = 0.15  # of the measured peak
@@ -97,8 +97,8 @@ def memory(*, full: Path | None = None, embedded: bool = True, split: bool = Fal
     Nothing is taken from the cache, so that every process traces and compiles its programs, as a first run does.
 
     Args:
-        full: a checkpoint of VGGT-1B's size, such as `python -m testing.make_checkpoint` writes and `vggtjax convert`
-            converts; its four settings take 8 GB of memory.
+        full: a checkpoint of VGGT-1B's size, such as `python -m tests.shared.make_checkpoint` writes and
+            `vggtjax convert` converts; its four settings take 8 GB of memory.
         embedded: measure the sixteen settings of the embedded model.
         split: measure nine settings of the embedded model on a CPU that is split into devices.
         out: JSON file for the rows.

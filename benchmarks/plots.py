@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.summaries import METRICS, Summary
-from vggtjax.geometry.similarity import centres, umeyama_sim3
+from vggtjax.similarity import centres, umeyama_sim3
 from vggtjax.storage.writing import writing
 
 SHOWN = ("abs_rel", "rotation_error", "centre_error", "point_distance_first")  # of those compared with the plain pass

@@ -1,4 +1,4 @@
-"""Filmed clips with ground truth, in windows: folders in the layout `plain` of vggtjax/evaluation/datasets."""
+"""Filmed clips with ground truth, in windows: folders in the layout `plain` of vggtjax/research/evaluation/datasets."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 
 from vggtjax.clips.clip import load_clip
+from vggtjax.clips.media.sampling import Sampling
 from vggtjax.clips.truth import Truth, at_clip_pixels, intrinsics_at_clip_pixels
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
-from vggtjax.evaluation.datasets import find_sequences
-from vggtjax.evaluation.datasets.sequence import LabelledSequence
-from vggtjax.media.sampling import Sampling
+from vggtjax.research.evaluation.datasets import find_sequences
+from vggtjax.research.evaluation.datasets.sequence import LabelledSequence
 
 
 class Windows(NamedTuple):

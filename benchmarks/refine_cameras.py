@@ -19,14 +19,14 @@ from vggtjax.cameras import world_from_camera
 from vggtjax.clips.clip import load_clip
 from vggtjax.clips.truth import at_clip_pixels, batched_truth
 from vggtjax.errors import InputError
-from vggtjax.evaluation.metrics.trajectory import rotation_error, trajectory_errors
-from vggtjax.pretrained.load import load_model
-from vggtjax.reconstruction import Reconstruction
-from vggtjax.refinement.refine import check_refinement
-from vggtjax.refinement.refine import refine_cameras as refine
-from vggtjax.scenes import SceneConfig, held_out_scenes
-from vggtjax.scenes.held_out import Kind
+from vggtjax.pipeline.pretrained.load import load_model
+from vggtjax.pipeline.refinement.refine import check_refinement
+from vggtjax.pipeline.refinement.refine import refine_cameras as refine
+from vggtjax.research.evaluation.metrics.trajectory import rotation_error, trajectory_errors
+from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.storage.writing import staging, writing
+from vggtjax.training.scenes import SceneConfig, held_out_scenes
+from vggtjax.training.scenes.held_out import Kind
 
 MASKS = {"static": ("mined",), "dynamic": ("mined", "none", "true")}
 _HEADINGS = (

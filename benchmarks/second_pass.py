@@ -21,16 +21,16 @@ from rich.console import Console
 from rich.progress import Progress as Bars
 
 from benchmarks.summaries import markdown_table
-from vggtjax.checkpoint import Model
 from vggtjax.errors import InputError
-from vggtjax.evaluation.metrics.trajectory import centre_error, rotation_error
 from vggtjax.method.mask import dynamic_tokens
+from vggtjax.network.checkpoint import Model
+from vggtjax.network.heads.pose import decode_pose
 from vggtjax.network.model import forward
-from vggtjax.network.pose import decode_pose
 from vggtjax.options import pairs_to_try
-from vggtjax.pretrained.load import load_model
-from vggtjax.scenes import SceneConfig, SyntheticClip, held_out_scenes
+from vggtjax.pipeline.pretrained.load import load_model
+from vggtjax.research.evaluation.metrics.trajectory import centre_error, rotation_error
 from vggtjax.storage.writing import staging, writing
+from vggtjax.training.scenes import SceneConfig, SyntheticClip, held_out_scenes
 
 _forward = jax.jit(forward, static_argnames=("config", "suppress", "outputs"))
 _AT_ONCE = 4

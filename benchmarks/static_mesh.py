@@ -18,15 +18,15 @@ from vggtjax.cameras import unproject
 from vggtjax.clips.clip import load_clip
 from vggtjax.clips.truth import Truth, at_clip_pixels, batched_truth, intrinsics_at_clip_pixels
 from vggtjax.errors import InputError
-from vggtjax.evaluation.metrics.point_clouds import nearest_distances
-from vggtjax.exports.mesh import static_mesh
-from vggtjax.geometry.similarity import umeyama_sim3
-from vggtjax.pretrained.load import load_model
-from vggtjax.reconstruction import Reconstruction
+from vggtjax.pipeline.pretrained.load import load_model
+from vggtjax.research.evaluation.metrics.point_clouds import nearest_distances
+from vggtjax.results.exports.mesh import static_mesh
+from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.shown import shown_points
-from vggtjax.scenes import SceneConfig, held_out_scenes
-from vggtjax.scenes.held_out import Kind
+from vggtjax.similarity import umeyama_sim3
 from vggtjax.storage.writing import staging, writing
+from vggtjax.training.scenes import SceneConfig, held_out_scenes
+from vggtjax.training.scenes.held_out import Kind
 
 _TRUE_POINTS, _SAMPLES, _MEASURED = 150_000, 200_000, 20_000  # of a clip
 _CELLS = 100  # of the points' extent along its longest side: one point of each

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from benchmarks.blind_guesses import Comparison
-from vggtjax.evaluation.ladder import LadderRow
+from vggtjax.research.evaluation.ladder import LadderRow
 
 METRICS = {  # fields of LadderRow, and their names in tables and plots
     "abs_rel": "AbsRel",

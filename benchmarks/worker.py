@@ -21,9 +21,9 @@ from unittest import mock
 
 import numpy as np
 
-from testing.seeded import seeded_images
+from tests.shared.seeded import seeded_images
 from vggtjax.config import vggt_1b
-from vggtjax.parity.public_code import add_checkout, build, give_weights, read_weights
+from vggtjax.research.parity.public_code import add_checkout, build, give_weights, read_weights
 from vggtjax.storage.cores import core_count
 from vggtjax.storage.process_memory import process_bytes
 

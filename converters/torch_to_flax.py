@@ -21,9 +21,9 @@ from converters.locate import Weights, locate
 from converters.rules import IGNORED, RULES, Transform
 from converters.strangers import refuse_strangers
 from converters.trained import own_heads, own_names
-from vggtjax.checkpoint import DType, flat_shapes, numpy_dtype, write_checkpoint
 from vggtjax.config import VGGT_HEADS, VGGTConfig, vggt_1b
 from vggtjax.errors import CheckpointError, InputError, problems_sentence, reading
+from vggtjax.network.checkpoint import DType, flat_shapes, numpy_dtype, write_checkpoint
 from vggtjax.progress import Progress, no_progress
 from vggtjax.storage.tensor_file import Spec
 

@@ -13,10 +13,10 @@ import jax
 import pytest
 from hypothesis import settings
 
-from testing.golden import GOLDEN, golden_config, golden_params
-from tests.tiny import save_tiny_demo
+from tests.shared.golden import GOLDEN, golden_config, golden_params
+from tests.shared.tiny import save_tiny_demo
 from vggtjax import VGGTConfig
-from vggtjax.pretrained import embedded
+from vggtjax.pipeline.pretrained import embedded
 
 CLIPS = Path(__file__).parents[2] / "shared" / "clips"
 _MAPPINGS = 40_000  # Linux allows 65530; so many programs take 5 GB

@@ -49,9 +49,9 @@ def test_bad_cues_are_named():
 @pytest.mark.parametrize(
     ("modules", "late"),
     [
-        ("vggtjax.commands.main, vggtjax.config, vggtjax.clips.clip", ["jax", "gradio"]),
+        ("vggtjax.interface.commands.main, vggtjax.config, vggtjax.clips.clip", ["jax", "gradio"]),
         (
-            "vggtjax.commands.reconstruct, vggtjax.pipeline.run",
+            "vggtjax.interface.commands.reconstruct, vggtjax.pipeline.run",
             ["scipy.spatial", "scipy.ndimage", "scipy.linalg", "skimage.segmentation", "skimage.morphology"],
         ),
     ],

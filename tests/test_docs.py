@@ -18,14 +18,14 @@ import pytest
 from PIL import Image
 
 import vggtjax
-from tests.documented import LANGUAGES, NOTEBOOKS, PAGES, ROOT, blocks, commands, page_name
+from tests.shared.documented import LANGUAGES, NOTEBOOKS, PAGES, ROOT, blocks, commands, page_name
 from vggtjax.clips.truth import Truth
-from vggtjax.commands import main as cli
+from vggtjax.interface.commands import main as cli
 from vggtjax.options import Options
-from vggtjax.pretrained import embedded
-from vggtjax.pretrained.embedded import demo_clip
+from vggtjax.pipeline.pretrained import embedded
+from vggtjax.pipeline.pretrained.embedded import demo_clip
+from vggtjax.pipeline.windows.plan import Windows
 from vggtjax.results.saving import Saving
-from vggtjax.windows.plan import Windows
 
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
 TARGETS = re.findall(r"^([\w -]+):", (ROOT / "Makefile").read_text(), flags=re.MULTILINE)
@@ -151,7 +151,7 @@ def _is_known(program: str, arguments: list[str]) -> bool:
     if program.startswith("python"):
         if arguments[:2] == ["-m", "benchmarks"]:
             return arguments[2] in BENCHMARKS
-        modules = ("testing.make_checkpoint", "pytest", "venv")
+        modules = ("tests.shared.make_checkpoint", "pytest", "venv")
         return (arguments[0] == "-m" and arguments[1] in modules) or (ROOT / arguments[0]).is_file()
     return program in (*OTHERS, ".", "cd")
 

@@ -21,7 +21,7 @@ def repository(folder: Path, umask: int) -> Path:
     folder.mkdir()
     for name in ("pyproject.toml", "README.md", "LICENSE", "Makefile"):
         shutil.copyfile(ROOT / name, folder / name)
-    for name in ("vggtjax", "converters", "testing", "tests"):
+    for name in ("vggtjax", "converters", "tests"):
         skipped = shutil.ignore_patterns("__pycache__")
         shutil.copytree(ROOT / name, folder / name, ignore=skipped, copy_function=shutil.copyfile)
     day = {f"GIT_{who}_DATE": "2026-01-01T00:00:00Z" for who in ("AUTHOR", "COMMITTER")}
@@ -78,7 +78,7 @@ def test_every_file_of_the_package_goes_into_the_wheel():
     def fits(path: Path, pattern: str) -> bool:
         return path.match(pattern) and len(path.parts) == len(Path(pattern).parts)
 
-    assert Path("pretrained/model.safetensors") in data
+    assert Path("pipeline/pretrained/model.safetensors") in data
     assert [path for path in data if not any(fits(path, pattern) for pattern in patterns["vggtjax"])] == []
 
 
@@ -93,9 +93,9 @@ def test_the_wheel_works_outside_the_repository(wheel, tmp_path):
     needed_files = (
         "__init__.pyi",
         "py.typed",
-        "pretrained/model.safetensors",
-        "pretrained/WEIGHTS-LICENSE.md",
-        "viewer/client/main.js",
+        "pipeline/pretrained/model.safetensors",
+        "pipeline/pretrained/WEIGHTS-LICENSE.md",
+        "results/viewer/client/main.js",
     )
     assert {f"vggtjax/{name}" for name in needed_files} <= set(names)
     (entry_points,) = (tmp_path / "installed").glob("*.dist-info/entry_points.txt")

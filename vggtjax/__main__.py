@@ -17,7 +17,7 @@ def run() -> int:
 def answered() -> int:
     """Run the command line, an interruption being an exit code."""
     try:
-        from vggtjax.commands.main import main
+        from vggtjax.interface.commands.main import main
 
         return main()
     except KeyboardInterrupt:

@@ -19,19 +19,19 @@ from benchmarks.accelerator.targets import Target
 from benchmarks.suite import work
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
-from vggtjax.learning.fit import FitClips, clip_loss
 from vggtjax.method.algorithm import Clips, run_method
-from vggtjax.method.fusion_family import paper_rule
-from vggtjax.method.fusion_inputs import observe
+from vggtjax.method.fusion.family import paper_rule
+from vggtjax.method.fusion.inputs import observe
 from vggtjax.method.passes import Passes
-from vggtjax.network.attention import attention
 from vggtjax.network.backbone import ClipBatch
-from vggtjax.network.frames import AXIS, BY_FRAME, REPLICATED, Frames, OnDevices
+from vggtjax.network.kernels.attention import attention
+from vggtjax.network.kernels.frames import AXIS, BY_FRAME, REPLICATED, Frames, OnDevices
+from vggtjax.network.kernels.narrow import narrowed
+from vggtjax.network.kernels.sampled import early_pairs
 from vggtjax.network.model import parameter_shapes, predict
-from vggtjax.network.narrow import narrowed
 from vggtjax.network.precision import Compute
-from vggtjax.network.sampled import early_pairs
 from vggtjax.options import Options
+from vggtjax.research.learning.fit import FitClips, clip_loss
 
 _BLIND = {"xla_gpu_autotune_level": 0, "xla_gpu_enable_triton_gemm": False}  # nothing can be timed
 
@@ -218,10 +218,10 @@ def _fusion_gradient(compiler: Compiler, setup: Setup) -> None:
 
 def _training_step(compiler: Compiler, setup: Setup) -> None:
     """Compile a step of training: loss and gradient by all parameters, and the optimiser."""
-    from vggtjax.scenes.textures import load_textures
     from vggtjax.training.data import make_batch
     from vggtjax.training.objective import LossWeights, init_probes, objective
     from vggtjax.training.recipe import OptimiserConfig, Phase, Recipe
+    from vggtjax.training.scenes.textures import load_textures
     from vggtjax.training.state import apply_gradient, loss_and_gradient, state_shapes
 
     phase = Phase(steps=1, batch=1, frames=(setup.frames,), height=setup.height, width=setup.width)

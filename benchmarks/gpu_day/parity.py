@@ -10,8 +10,8 @@ import numpy as np
 
 from benchmarks.gpu_day.lines import Lines
 from benchmarks.suite.cases import Size
-from testing.golden import BFLOAT16, FORWARD, GOLDEN, OUTPUTS, TOLERANCE, GoldenPass, golden_params, spread_error
-from testing.seeded import seeded_images
+from tests.shared.golden import BFLOAT16, FORWARD, GOLDEN, OUTPUTS, TOLERANCE, GoldenPass, golden_params, spread_error
+from tests.shared.seeded import seeded_images
 from vggtjax.method.cues import GramCues
 from vggtjax.network.model import forward
 

@@ -19,7 +19,7 @@ from benchmarks.gpu_day.paths import attention_paths
 from benchmarks.gpu_day.speed import speed
 from benchmarks.suite.cases import Size
 from benchmarks.suite.report import describe, machine
-from vggtjax.network.attention import cudnn_works
+from vggtjax.network.kernels.attention import cudnn_works
 
 
 class Part(NamedTuple):

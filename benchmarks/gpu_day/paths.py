@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.gpu_day.lines import Lines
 from benchmarks.suite.cases import Size
 from benchmarks.suite.measure import timed
-from vggtjax.network import attention, cpu_attention
+from vggtjax.network.kernels import attention, cpu_attention
 
 Path = Callable[..., jax.Array]  # queries, keys, values, visible keys or None
 

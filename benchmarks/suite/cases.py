@@ -11,12 +11,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from benchmarks.suite.work import Grid
-from testing.seeded import seeded_images
+from tests.shared.seeded import seeded_images
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.network.layers import Params
 from vggtjax.network.model import init_params
-from vggtjax.pretrained.embedded import demo_model
+from vggtjax.pipeline.pretrained.embedded import demo_model
 
 Size = Literal["tiny", "demo", "full"]
 DType = Literal["float32", "bfloat16"]

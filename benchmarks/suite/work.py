@@ -11,11 +11,11 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 
 from vggtjax.config import VGGTConfig
-from vggtjax.network import camera_head as camera
 from vggtjax.network.aggregator import SPECIAL_TOKENS
 from vggtjax.network.backbone import REGISTERS
-from vggtjax.network.dpt_head import DENSE_HEADS, HIDDEN
-from vggtjax.network.pose import POSE_SIZE
+from vggtjax.network.heads import camera_head as camera
+from vggtjax.network.heads.dpt_head import DENSE_HEADS, HIDDEN
+from vggtjax.network.heads.pose import POSE_SIZE
 
 Work = Mapping[str, float]  # kind -> FLOP, functions of a number, or bytes
 Grid = tuple[int, int]  # rows and columns of patches

@@ -19,7 +19,7 @@ from vggtjax.errors import InputError
 from vggtjax.method.cues import GramCues
 from vggtjax.network.aggregator import aggregate
 from vggtjax.network.backbone import encode
-from vggtjax.network.dpt_head import predict_dense, project_tap
+from vggtjax.network.heads.dpt_head import predict_dense, project_tap
 from vggtjax.network.model import forward
 from vggtjax.network.precision import Compute
 from vggtjax.pipeline.infer import infer
@@ -31,7 +31,7 @@ _STEPS = ("trace", "lower", "XLA")
 _IMPORTED = "import sys, atexit; atexit.register(lambda: sys.stderr.write(str('jax' in sys.modules))); "
 _STARTS = {
     "import vggtjax": "import vggtjax",
-    "vggtjax --help": "from vggtjax.commands.main import main; sys.exit(main(['--help']))",
+    "vggtjax --help": "from vggtjax.interface.commands.main import main; sys.exit(main(['--help']))",
 }
 
 

@@ -6,8 +6,8 @@ import io
 import os
 from contextlib import redirect_stdout
 
-from vggtjax.commands.main import COMMANDS, print_help
-from vggtjax.commands.overview import overview
+from vggtjax.interface.commands.main import COMMANDS, print_help
+from vggtjax.interface.commands.overview import overview
 
 MARK = "HELP OF EVERY COMMAND"  # in place of what plain Markdown shows: site.py
 _WIDTH = "100"

@@ -11,7 +11,7 @@ import numpy as np
 
 import vggtjax
 from vggtjax.options import ABLATION
-from vggtjax.pretrained.embedded import demo_clip
+from vggtjax.pipeline.pretrained.embedded import demo_clip
 
 model, truth = vggtjax.load_model("demo"), demo_clip()
 images = jnp.asarray(truth.images[None])  # [B, S, H, W, 3] in [0, 1]

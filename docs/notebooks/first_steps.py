@@ -11,8 +11,8 @@ import numpy as np
 
 import vggtjax
 from vggtjax.cameras import world_from_camera
-from vggtjax.evaluation import mask_scores, trajectory_errors, video_depth_errors
-from vggtjax.pretrained.embedded import demo_clip
+from vggtjax.pipeline.pretrained.embedded import demo_clip
+from vggtjax.research.evaluation import mask_scores, trajectory_errors, video_depth_errors
 
 model = vggtjax.load_model("demo")
 truth = demo_clip()  # a generated clip whose depth, masks and cameras are known exactly

@@ -13,8 +13,8 @@ import numpy as np
 import optax
 
 import vggtjax
-from vggtjax.learning import fuse, negative_log_likelihood, observe, paper_rule
-from vggtjax.pretrained.embedded import demo_clip
+from vggtjax.pipeline.pretrained.embedded import demo_clip
+from vggtjax.research.learning import fuse, negative_log_likelihood, observe, paper_rule
 
 model, truth = vggtjax.load_model("demo"), demo_clip()
 images, true_depth = jnp.asarray(truth.images[None]), jnp.asarray(truth.depth[None])
@@ -87,5 +87,5 @@ def abs_rel(depth):
 print("AbsRel of the paper's rule:", round(abs_rel(paper.depth), 3), "fitted:", round(abs_rel(fitted.depth), 3))
 
 # %% [markdown]
-# `vggtjax.learning.save_fusion` writes a rule that `vggtjax reconstruct --fusion` reads, and `fit_fusion` does all
-# this with early stopping on other clips.
+# `vggtjax.research.learning.save_fusion` writes a rule that `vggtjax reconstruct --fusion` reads, and `fit_fusion` does
+# all this with early stopping on other clips.

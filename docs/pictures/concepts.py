@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from vggtjax import Reconstruction
-    from vggtjax.checkpoint import Model
     from vggtjax.clips.truth import Truth
+    from vggtjax.network.checkpoint import Model
 
 FOLDER = Path(__file__).resolve().parent / "made"
 SCENES, SCENE_SEED = 4, 200  # of the gallery: the first of the seed, whatever came out
@@ -93,7 +93,7 @@ def _demo_clip(model: Model) -> Clip:
     from vggtjax.method.cues import GramCues
     from vggtjax.network.backbone import ClipBatch
     from vggtjax.network.model import predict
-    from vggtjax.pretrained.embedded import demo_clip
+    from vggtjax.pipeline.pretrained.embedded import demo_clip
 
     truth, config = demo_clip(), model.config
     clip = vggtjax.load_clip(truth.images, model=model, size=truth.images.shape[2])
@@ -114,8 +114,8 @@ def _generated(model: Model) -> list[Clip]:
     """Return the first held-out scenes of a seed that neither training nor a benchmark draws, reconstructed."""
     import vggtjax
     from vggtjax.clips.truth import Truth
-    from vggtjax.scenes.config import SceneConfig
-    from vggtjax.scenes.held_out import held_out_scenes
+    from vggtjax.training.scenes.config import SceneConfig
+    from vggtjax.training.scenes.held_out import held_out_scenes
 
     config = SceneConfig(height=SCENE_SIDE, width=SCENE_SIDE, frames=SCENE_FRAMES)
     scenes = held_out_scenes("dynamic", SCENES, config, seed=SCENE_SEED)
@@ -132,7 +132,7 @@ def passes(clip: Clip) -> Figure:
     """Pictures, the tokens whose keys the second pass ignores, depth of both passes and truth; cameras from above."""
     from matplotlib import pyplot
 
-    from vggtjax.evaluation.metrics.depth import median_scale
+    from vggtjax.research.evaluation.metrics.depth import median_scale
 
     truth, result = clip.truth, clip.result
     first, second = (np.asarray(p.depth[0]) for p in (result.passes.first, result.passes.second))
@@ -214,7 +214,7 @@ def fusion(clip: Clip) -> Figure:
     """Confidence of both passes, the weight of the second, and the errors of both and of the fused depth."""
     from matplotlib import pyplot
 
-    from vggtjax.evaluation.metrics.depth import median_scale
+    from vggtjax.research.evaluation.metrics.depth import median_scale
 
     truth, result = clip.truth, clip.result
     both = (result.passes.first, result.passes.second)
@@ -252,13 +252,13 @@ def matches(model: Model, clip: Clip) -> Figure:
     from matplotlib import pyplot
 
     from vggtjax.cameras import Cameras
-    from vggtjax.method.adjustment import Adjustment, adjust, at_patches
-    from vggtjax.method.matched_mask import motion_pixels
-    from vggtjax.method.matched_motion import motion
-    from vggtjax.method.matches import frame_pairs, patch_centres
+    from vggtjax.method.matching.adjustment import Adjustment, adjust, at_patches
+    from vggtjax.method.matching.matched_mask import motion_pixels
+    from vggtjax.method.matching.matched_motion import motion
+    from vggtjax.method.matching.matches import frame_pairs, patch_centres
     from vggtjax.method.passes import first_pass
     from vggtjax.network.backbone import ClipBatch
-    from vggtjax.network.pose import decode_pose
+    from vggtjax.network.heads.pose import decode_pose
     from vggtjax.results.previews import overlay
 
     truth, result = clip.truth, clip.by_matches
@@ -335,8 +335,8 @@ def gallery_sheet(clip: Clip, number: int) -> Figure:
 
 def _cameras(axes: Any, clip: Clip) -> None:
     """Plot the paths of both passes and the true one from above, in the axes of the first camera."""
-    from vggtjax.geometry.similarity import centres, umeyama_sim3
-    from vggtjax.network.pose import decode_pose
+    from vggtjax.network.heads.pose import decode_pose
+    from vggtjax.similarity import centres, umeyama_sim3
 
     true = np.asarray(clip.truth.camera_from_world)
     size = clip.result.depth.shape[1:3]

@@ -10,9 +10,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from vggtjax import Reconstruction
-    from vggtjax.checkpoint import Model
     from vggtjax.clips.truth import Truth
-    from vggtjax.refinement.cells import Cells
+    from vggtjax.network.checkpoint import Model
+    from vggtjax.pipeline.refinement.cells import Cells
 
 SIDE = 288  # pixels of the source; the network sees fewer
 _SURE = 25.0  # inverse variance of a log depth that is drawn
@@ -36,10 +36,10 @@ def fitted(model: Model, scene: int, seed: int, frames: int) -> Fitted:
     """Return a held-out scene whose source has more pixels than the network sees, reconstructed by `4dvggt-m`."""
     import vggtjax
     from vggtjax.clips.truth import Truth, at_clip_pixels, intrinsics_at_clip_pixels
-    from vggtjax.refinement.consistent import consistent_depth
-    from vggtjax.refinement.pixel_mask import mask_by_pixels
-    from vggtjax.scenes.config import SceneConfig
-    from vggtjax.scenes.held_out import held_out_scenes
+    from vggtjax.pipeline.refinement.consistent import consistent_depth
+    from vggtjax.pipeline.refinement.pixel_mask import mask_by_pixels
+    from vggtjax.training.scenes.config import SceneConfig
+    from vggtjax.training.scenes.held_out import held_out_scenes
 
     scenes = held_out_scenes("dynamic", scene + 1, SceneConfig(height=SIDE, width=SIDE, frames=frames), seed=seed)
     source = Truth(*(np.asarray(getattr(scenes, name)[scene]) for name in Truth._fields))
@@ -58,7 +58,7 @@ def steps(scene: Fitted) -> Figure:
     from concepts import _depth, _image
     from matplotlib import pyplot
 
-    from vggtjax.evaluation.metrics.depth import median_scale
+    from vggtjax.research.evaluation.metrics.depth import median_scale
     from vggtjax.results.previews import overlay
 
     cells, matched, weight, ratio = _matched(scene)
@@ -97,11 +97,11 @@ def _matched(scene: Fitted) -> tuple[Cells, np.ndarray, np.ndarray, np.ndarray]:
     import dataclasses
 
     from vggtjax.cameras import Cameras
-    from vggtjax.known.intrinsics import shared_focal
-    from vggtjax.method.matches import frame_pairs
-    from vggtjax.refinement.cells import at_scale, cells_of, grey_pictures
-    from vggtjax.refinement.dense import PREDICTED, ROUNDS, adjust_to_pixels
-    from vggtjax.refinement.pixel_matches import expected_matches, match_pixels
+    from vggtjax.method.matching.matches import frame_pairs
+    from vggtjax.pipeline.known.intrinsics import shared_focal
+    from vggtjax.pipeline.refinement.cells import at_scale, cells_of, grey_pictures
+    from vggtjax.pipeline.refinement.dense import PREDICTED, ROUNDS, adjust_to_pixels
+    from vggtjax.pipeline.refinement.pixel_matches import expected_matches, match_pixels
 
     predicted = scene.predicted
     start = dataclasses.replace(predicted, intrinsics=shared_focal(predicted).astype(np.float32))
@@ -125,7 +125,7 @@ def surfaces(scene: Fitted) -> Figure:
     from matplotlib import pyplot
 
     from vggtjax.cameras import unproject
-    from vggtjax.evaluation.metrics.depth import median_scale
+    from vggtjax.research.evaluation.metrics.depth import median_scale
 
     truth, still = scene.truth, ~scene.truth.dynamic_mask
     figure, axes = pyplot.subplots(1, 3, figsize=(11.5, 2.9), layout="constrained", sharex=True, sharey=True)

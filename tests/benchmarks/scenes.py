@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from tests.tiny import tiny_config
-from vggtjax.checkpoint import save_model
-from vggtjax.evaluation.ladder import LadderRow
+from tests.shared.tiny import tiny_config
+from vggtjax.network.checkpoint import save_model
 from vggtjax.network.model import init_params
-from vggtjax.scenes import SceneConfig, SyntheticClip
+from vggtjax.research.evaluation.ladder import LadderRow
+from vggtjax.training.scenes import SceneConfig, SyntheticClip
 
 SIDE = 28
 

@@ -20,9 +20,9 @@ from benchmarks import (
     static_mesh,
 )
 from tests.benchmarks.scenes import SIDE, drawn_scenes, tiny_file
-from vggtjax.checkpoint import read_model
 from vggtjax.errors import InputError
-from vggtjax.pretrained.embedded import demo_clip
+from vggtjax.network.checkpoint import read_model
+from vggtjax.pipeline.pretrained.embedded import demo_clip
 
 pytestmark = pytest.mark.filterwarnings("ignore:the field of view")
 

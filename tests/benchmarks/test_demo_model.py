@@ -19,7 +19,7 @@ from benchmarks.blind_guesses import (
 from benchmarks.real_clips import load_windows, window_starts
 from benchmarks.summaries import comparison_table
 from tests.benchmarks.scenes import SIDE, drawn_scenes, row, tiny_file
-from tests.tiny import tiny_config
+from tests.shared.tiny import tiny_config
 from vggtjax.clips.truth import Truth
 from vggtjax.errors import InputError
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from tests.tiny import tiny_model
+from tests.shared.tiny import tiny_model
 from vggtjax.clips.clip import load_clip
 from vggtjax.errors import ClipError, InputError
 from vggtjax.pipeline.inputs import read_inputs

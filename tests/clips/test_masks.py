@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image, ImageOps
 
-from testing.seeded import seeded_images
-from tests.tiny import tiny_model
-from tests.videos import write_video
+from tests.shared.seeded import seeded_images
+from tests.shared.tiny import tiny_model
+from tests.shared.videos import write_video
 from vggtjax import load_clip, reconstruct
 from vggtjax.clips.masks import MaskWarning, load_masks, masks_at_clip_pixels, read_mask
 from vggtjax.errors import ClipError, InputError

@@ -11,10 +11,10 @@ import pytest
 from PIL import Image
 
 from vggtjax import load_clip
+from vggtjax.clips.media.animation import Animation
+from vggtjax.clips.media.sampling import Sampling
 from vggtjax.clips.sources import open_source
 from vggtjax.errors import ClipError
-from vggtjax.media.animation import Animation
-from vggtjax.media.sampling import Sampling
 
 SIZE = (64, 32)
 RED, BLUE = (200, 40, 40), (40, 40, 200)

@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+from vggtjax.clips.media.images import to_rgb
+from vggtjax.clips.media.sampling import Frame
 from vggtjax.clips.preprocessing import Fit, Fitter
 from vggtjax.errors import ClipError, InputError
-from vggtjax.media.images import to_rgb
-from vggtjax.media.sampling import Frame
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "preprocess.npz"
 

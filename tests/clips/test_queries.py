@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from testing.seeded import seeded_images
-from tests.tiny import tiny_config
+from tests.shared.seeded import seeded_images
+from tests.shared.tiny import tiny_config
 from vggtjax import Reconstruction, init_params, load_clip, reconstruct
-from vggtjax.checkpoint import Model
 from vggtjax.clips.queries import Queries, check_words, parse_queries
 from vggtjax.errors import InputError, ResultError
+from vggtjax.network.checkpoint import Model
 
 pytestmark = pytest.mark.filterwarnings("ignore:the field of view")  # seeded weights give odd cameras
 

@@ -7,13 +7,13 @@ import pytest
 from PIL import Image
 
 from vggtjax import Reconstruction, load_clip
+from vggtjax.clips.media.sampling import Sampling
 from vggtjax.clips.preprocessing import Fitter
 from vggtjax.clips.shots import find_shots, look_at, shot_samplings
 from vggtjax.clips.sources import open_source
-from vggtjax.commands import main as cli
 from vggtjax.errors import ClipError, InputError
-from vggtjax.media.sampling import Sampling
-from vggtjax.windows.frames import window_clips
+from vggtjax.interface.commands import main as cli
+from vggtjax.pipeline.windows.frames import window_clips
 
 SIDE = 96
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from vggtjax.clips.media.arrays import ArrayFrames
+from vggtjax.clips.media.images import ImageFiles
+from vggtjax.clips.media.order import in_order
+from vggtjax.clips.media.sampling import Sampling
+from vggtjax.clips.media.video import VideoFile
 from vggtjax.clips.sources import clips_by_name, open_source
 from vggtjax.errors import ClipError
-from vggtjax.media.arrays import ArrayFrames
-from vggtjax.media.images import ImageFiles
-from vggtjax.media.order import in_order
-from vggtjax.media.sampling import Sampling
-from vggtjax.media.video import VideoFile
 
 
 @pytest.fixture

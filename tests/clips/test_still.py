@@ -7,7 +7,7 @@ import pytest
 
 from vggtjax import load_clip
 from vggtjax.clips.still import same_picture
-from vggtjax.pretrained.embedded import demo_clip
+from vggtjax.pipeline.pretrained.embedded import demo_clip
 
 OLD_ROUNDING = 2 / 255
 GREY = np.full((84, 98, 3), 100 / 255, np.float32)

@@ -13,8 +13,8 @@ from safetensors.numpy import save_file
 
 from converters import convert, convert_state_dict
 from converters.files import choose_file, read_state_dict, weight_files
-from testing.make_checkpoint import make_checkpoint
-from testing.seeded import seeded_state_dict
+from tests.shared.make_checkpoint import make_checkpoint
+from tests.shared.seeded import seeded_state_dict
 from vggtjax import load_model
 from vggtjax.errors import CheckpointError
 

@@ -16,8 +16,8 @@ import pytest
 
 from converters import convert_state_dict
 from converters.locate import locate
-from testing.make_checkpoint import make_checkpoint
-from testing.seeded import seeded_state_dict
+from tests.shared.make_checkpoint import make_checkpoint
+from tests.shared.seeded import seeded_state_dict
 from vggtjax import load_model
 from vggtjax.errors import CheckpointError
 

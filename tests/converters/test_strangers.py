@@ -9,7 +9,7 @@ from safetensors.numpy import save_file
 from converters import convert, convert_state_dict
 from converters.locate import locate
 from converters.strangers import STRANGERS, refuse_strangers
-from testing.seeded import seeded_state_dict
+from tests.shared.seeded import seeded_state_dict
 from vggtjax.errors import CheckpointError
 
 # Keys as the networks' public code builds them.

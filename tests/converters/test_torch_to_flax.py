@@ -20,11 +20,11 @@ from safetensors.numpy import save_file
 from converters import convert, convert_state_dict
 from converters.rules import CONV, DENSE, DEPTH_TO_SPACE, IGNORED, POINTWISE, RULES, SAME, TRACKS, UNBATCHED
 from converters.torch_to_flax import source_shapes
-from testing.seeded import seeded_state_dict
+from tests.shared.seeded import seeded_state_dict
 from vggtjax import forward, load_model
-from vggtjax.checkpoint import flat_shapes
 from vggtjax.config import vggt_1b
 from vggtjax.errors import CheckpointError, InputError, OutputError
+from vggtjax.network.checkpoint import flat_shapes
 from vggtjax.network.model import HEADS
 
 VIRTUAL_TRACKS = "track_head.tracker.updateformer.virual_tracks"

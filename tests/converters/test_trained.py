@@ -13,7 +13,7 @@ from safetensors.numpy import save_file
 
 from converters import convert_state_dict
 from converters.files import read_state_dict
-from testing.seeded import seeded_state_dict
+from tests.shared.seeded import seeded_state_dict
 from vggtjax import forward, load_model
 from vggtjax.errors import CheckpointError, InputError
 

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.dataset_files import write
 from tests.fuzz.cases import Reader, Sample, read, scratch_folder
 from tests.fuzz.readers import READERS
+from tests.shared.dataset_files import write
 from vggtjax.errors import ClipError, InputError, VggtjaxError
 
 CASES, MANY = 4, 2000

@@ -11,14 +11,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from tests.static_world import GRID, PATCH, StaticWorld
+from tests.shared.static_world import GRID, PATCH, StaticWorld
+from vggtjax.method.matching.witnesses import Seen
 from vggtjax.method.passes import mine
-from vggtjax.method.witnesses import Seen
 from vggtjax.network.backbone import ClipBatch
-from vggtjax.network.frames import BY_FRAME, Frames
-from vggtjax.network.gathered_attention import gathered_attention
+from vggtjax.network.heads.pose import encode_pose
+from vggtjax.network.kernels.frames import BY_FRAME, Frames
+from vggtjax.network.kernels.gathered_attention import gathered_attention
 from vggtjax.network.model import Predictions
-from vggtjax.network.pose import encode_pose
 from vggtjax.pipeline.devices import frames_mesh, shard_frames
 from vggtjax.pipeline.lengths import shared_length
 

@@ -6,9 +6,9 @@ import jax
 import numpy as np
 import pytest
 
-from tests.static_world import GRID, StaticWorld
+from tests.shared.static_world import GRID, StaticWorld
 from vggtjax.cameras import Cameras
-from vggtjax.method.adjustment import Adjustment, adjust
+from vggtjax.method.matching.adjustment import Adjustment, adjust
 
 FREE = Adjustment(depth_prior=100.0, rotation_prior=100.0, translation_prior=100.0)
 fast = jax.jit(adjust, static_argnames=("grid", "how"))

@@ -11,22 +11,22 @@ import pytest
 from jax.sharding import Mesh
 from jax.tree_util import Partial
 
-from tests.tiny import tiny_model
+from tests.shared.tiny import tiny_model
 from vggtjax import Clips, Options, assemble, encode, forward, infer, load_clip, reconstruct, reconstruct_long
-from vggtjax.batch.many import reconstruct_many
-from vggtjax.checkpoint import Model
 from vggtjax.clips.truth import Truth
 from vggtjax.config import MotionConfig
 from vggtjax.errors import InputError
-from vggtjax.evaluation.ladder import ladder
-from vggtjax.learning import paper_rule, reconstruct_soft, soft_masking
 from vggtjax.method.algorithm import run_method, run_passes
-from vggtjax.method.fusion_family import fuse
-from vggtjax.method.fusion_inputs import observe
+from vggtjax.method.fusion.family import fuse
+from vggtjax.method.fusion.inputs import observe
 from vggtjax.method.soft_mask import soft_pixels
+from vggtjax.network.checkpoint import Model
+from vggtjax.pipeline.batch.many import reconstruct_many
 from vggtjax.pipeline.run import compile_ahead
 from vggtjax.pipeline.several import reconstruct_methods
-from vggtjax.windows.plan import Windows
+from vggtjax.pipeline.windows.plan import Windows
+from vggtjax.research.evaluation.ladder import ladder
+from vggtjax.research.learning import paper_rule, reconstruct_soft, soft_masking
 
 SIDE, FRAMES = 28, 4
 IMAGES: Any = np.random.default_rng(0).random((2, FRAMES, SIDE, SIDE, 3), np.float32)

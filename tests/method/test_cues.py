@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from jax.sharding import Mesh
 
-from tests import reference
+from tests.shared import reference
 from vggtjax.config import Cue, MotionConfig
 from vggtjax.errors import InputError
 from vggtjax.method.cues import GramCues, _sample_std, _unit, normalise, sources
-from vggtjax.network.frames import BY_FRAME, Frames
+from vggtjax.network.kernels.frames import BY_FRAME, Frames
 
 OFFSETS = MotionConfig().offsets
 DEPTH, SPECIAL, PATCHES = 6, 3, 5

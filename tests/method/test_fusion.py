@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from vggtjax import fuse_depth
-from vggtjax.method.fusion import replace_depth, scale_between
+from vggtjax.method.fusion.rule import replace_depth, scale_between
 
 D1, C1 = jnp.asarray([[[2.0, 2.0, 2.0]]]), jnp.asarray([[[1.0, 1.0, 3.0]]])
 D2, C2 = jnp.asarray([[[4.0, 4.0, 4.0]]]), jnp.asarray([[[3.0, 3.0, 1.0]]])

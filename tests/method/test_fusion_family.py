@@ -10,11 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from tests.simulated import scattered
+from tests.shared.simulated import scattered
 from vggtjax import fuse_depth
 from vggtjax.errors import InputError
-from vggtjax.method import fusion_family as family
-from vggtjax.method.fusion_family import (
+from vggtjax.method.fusion.family import (
     FEATURES,
     PARTS,
     Observations,
@@ -26,6 +25,7 @@ from vggtjax.method.fusion_family import (
     soft_mask,
     start,
 )
+from vggtjax.method.fusion.rule import family as family
 
 SHAPE = (2, 3, 4)
 fuse = jax.jit(family.fuse)

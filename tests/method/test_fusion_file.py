@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
 
-from tests.simulated import scattered
-from tests.tiny import tiny_config
-from vggtjax.checkpoint import Model
+from tests.shared.simulated import scattered
+from tests.shared.tiny import tiny_config
 from vggtjax.errors import InputError
-from vggtjax.method.fusion_family import parse_family, start
-from vggtjax.method.fusion_file import load_fusion, origin_of_fit, save_fusion, warn_if_fitted_otherwise
+from vggtjax.method.fusion.family import parse_family, start
+from vggtjax.method.fusion.file import load_fusion, origin_of_fit, save_fusion, warn_if_fitted_otherwise
+from vggtjax.network.checkpoint import Model
 from vggtjax.options import Options
 from vggtjax.storage.tensor_file import read_tensors
 

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy.ndimage import distance_transform_edt
 
 from vggtjax.errors import InputError
-from vggtjax.method.fusion_family import soft_mask
-from vggtjax.method.fusion_inputs import REACH, edge_distance, edge_proximity, observe
+from vggtjax.method.fusion.family import soft_mask
+from vggtjax.method.fusion.inputs import REACH, edge_distance, edge_proximity, observe
 from vggtjax.method.passes import Passes
 from vggtjax.network.model import Predictions
 

@@ -10,7 +10,7 @@ from scipy import ndimage
 from skimage.measure import label
 
 from vggtjax.errors import InputError
-from vggtjax.method.instances import find_instances
+from vggtjax.results.instances import find_instances
 
 
 def boxes(*tracks, frames=5, size=(24, 90)) -> tuple[np.ndarray, np.ndarray]:

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from jax.sharding import Mesh
 from skimage.filters import threshold_multiotsu, threshold_otsu
 
-from tests.eight_devices import printed_by
-from tests.reference import multi_otsu
+from tests.shared.eight_devices import printed_by
+from tests.shared.reference import multi_otsu
 from vggtjax.errors import InputError
 from vggtjax.method import mask as eager
 from vggtjax.method.mask import (
@@ -26,10 +26,10 @@ from vggtjax.method.mask import (
     smooth_over_time,
     upsample,
 )
+from vggtjax.method.matching.witnesses import Seen
 from vggtjax.method.passes import mine
-from vggtjax.method.witnesses import Seen
 from vggtjax.network.backbone import ClipBatch
-from vggtjax.network.frames import Frames
+from vggtjax.network.kernels.frames import Frames
 
 _otsu = jax.jit(otsu_threshold)
 _multi_otsu = jax.jit(multi_otsu_threshold, static_argnames="bins")

@@ -10,9 +10,9 @@ from scipy import ndimage
 from vggtjax.errors import InputError
 from vggtjax.method import mask_refinement
 from vggtjax.method.mask_refinement import refine_masks
-from vggtjax.scenes import load_textures
-from vggtjax.scenes.config import SceneConfig
-from vggtjax.scenes.render import generate
+from vggtjax.training.scenes import load_textures
+from vggtjax.training.scenes.config import SceneConfig
+from vggtjax.training.scenes.render import generate
 
 CONFIG = SceneConfig(height=96, width=96, frames=6, dynamic=1.0, noise=0.0, flicker=0.0, static_camera=0.0)
 

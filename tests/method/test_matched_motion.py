@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.static_world import GRID, PATCH, StaticWorld
+from tests.shared.static_world import GRID, PATCH, StaticWorld
 from vggtjax.method.edges import follow_edges
-from vggtjax.method.matched_mask import mine_matched_mask
-from vggtjax.method.matched_motion import motion
-from vggtjax.network.pose import encode_pose
+from vggtjax.method.matching.matched_mask import mine_matched_mask
+from vggtjax.method.matching.matched_motion import motion
+from vggtjax.network.heads.pose import encode_pose
 
 find = jax.jit(motion, static_argnames="grid")
 SIZE = (GRID[0] * PATCH, GRID[1] * PATCH)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from jax.sharding import Mesh
 
-from vggtjax.method.matches import DenseMatches, frame_pairs
-from vggtjax.network.frames import BY_FRAME, Frames
+from vggtjax.method.matching.matches import DenseMatches, frame_pairs
+from vggtjax.network.kernels.frames import BY_FRAME, Frames
 
 S, GRID, SPECIAL, DEPTH, LAYERS = 10, (3, 4), 2, 4, (1, 2)
 PATCHES = GRID[0] * GRID[1]

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from testing.seeded import seeded_images
-from tests.tiny import tiny_model
+from tests.shared.seeded import seeded_images
+from tests.shared.tiny import tiny_model
 from vggtjax import (
     METHODS,
     assemble,
@@ -22,11 +22,11 @@ from vggtjax import (
     reconstruct,
     run_passes,
 )
-from vggtjax.checkpoint import Model
 from vggtjax.errors import InputError
-from vggtjax.method.fusion import scale_between
+from vggtjax.method.fusion.rule import scale_between
 from vggtjax.method.mask import dynamic_pixels, dynamic_tokens, mine_mask
 from vggtjax.method.passes import motion_saliency
+from vggtjax.network.checkpoint import Model
 from vggtjax.options import Options
 from vggtjax.results.result import FieldOfViewWarning
 

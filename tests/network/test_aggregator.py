@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from tests import reference
+from tests.shared import reference
 from vggtjax import VGGTConfig
 from vggtjax.config import Suppress
 from vggtjax.network.aggregator import aggregate, identity

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from jax.experimental.pallas import tpu
 
-from vggtjax.network import attention, cpu_attention
-from vggtjax.network.cpu_attention import attention_in_chunks
+from vggtjax.network.kernels import attention, cpu_attention
+from vggtjax.network.kernels.cpu_attention import attention_in_chunks
 
 
 def _formula(q, k, v, kept):
@@ -93,7 +93,7 @@ def test_what_does_not_fit_at_once_is_cut(monkeypatch, most):
 
 @pytest.mark.parametrize(("cores", "times"), [(2, 1), (4, 2), (128, 8)])
 def test_chunks_grow_with_the_cores_but_not_without_bound(monkeypatch, cores, times):
-    monkeypatch.setattr("vggtjax.network.pieces.core_count", lambda: cores)
+    monkeypatch.setattr("vggtjax.network.kernels.pieces.core_count", lambda: cores)
     queries = jnp.zeros((12_800, 1))
     assert cpu_attention._chunks(queries, keys=5000).shape == (16 // times, 800 * times, 1)
     assert cpu_attention._chunks(queries, keys=10**6).shape == (16, 800, 1)

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vggtjax.network import cpu_convolution
-from vggtjax.network.cpu_convolution import same_convolution
+from vggtjax.network.kernels import cpu_convolution
+from vggtjax.network.kernels.cpu_convolution import same_convolution
 
 
 @pytest.mark.parametrize(  # a row, a few rows, everything

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.tiny import tiny_model
-from vggtjax.network import dpt_head
-from vggtjax.network.dpt_head import predict_dense, resize_aligned
+from tests.shared.tiny import tiny_model
+from vggtjax.network.heads import dpt_head
+from vggtjax.network.heads.dpt_head import predict_dense, resize_aligned
 
 
 @pytest.mark.parametrize("size", [(13, 9), (5, 9), (3, 4), (1, 1)])

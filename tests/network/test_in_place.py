@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vggtjax.network.in_place import added_if, replaced_if
+from vggtjax.network.kernels.in_place import added_if, replaced_if
 
 
 @pytest.mark.parametrize("adds", [False, True])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from vggtjax.network import pieces
+from vggtjax.network.kernels import pieces
 from vggtjax.network.layers import _fused_gelu, gelu
 
 

@@ -9,14 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from testing.seeded import seeded_images
-from tests.tiny import tiny_config
+from tests.shared.seeded import seeded_images
+from tests.shared.tiny import tiny_config
 from vggtjax import VGGTConfig, forward
 from vggtjax.config import HEAD_NAMES, VGGT_HEADS, vggt_1b
 from vggtjax.errors import InputError
-from vggtjax.network.dpt_head import DENSE_HEADS, DenseMap
+from vggtjax.network.heads.dpt_head import DENSE_HEADS, DenseMap
+from vggtjax.network.kernels.narrow import narrowed
 from vggtjax.network.model import FIELDS, HEADS, init_params, parameter_shapes
-from vggtjax.network.narrow import narrowed
 from vggtjax.network.suppression import Suppression
 
 SIZE = (28, 42)
@@ -62,7 +62,7 @@ def test_the_program_of_an_accelerator_gives_the_same(monkeypatch, params, confi
     given = {"config": config, "dynamic_tokens": mask, "outputs": ("camera", "depth")}
     wanted = _forward(params, images, **given)
     monkeypatch.setattr(jax.lax, "platform_dependent", lambda *inputs, default, **_: default(*inputs))
-    monkeypatch.setattr("vggtjax.network.pieces._rows_on_cpu", lambda rows: 1)
+    monkeypatch.setattr("vggtjax.network.kernels.pieces._rows_on_cpu", lambda rows: 1)
     monkeypatch.setattr("vggtjax.network.aggregator._CAPTURED_ROWS", 44)
     made = forward(params, images, **given)
     for name in ("pose_encoding", "depth", "depth_confidence"):

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from vggtjax import decode_pose
-from vggtjax.network.pose import encode_pose, matrix_to_quaternion, quaternion_to_matrix
+from vggtjax.network.heads.pose import encode_pose, matrix_to_quaternion, quaternion_to_matrix
 
 _unit = st.floats(-1, 1, width=32)
 _decode = jax.jit(lambda pose: decode_pose(pose, (140, 168)))

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from vggtjax import load_model
-from vggtjax.checkpoint import save_model
 from vggtjax.clips.clip import load_clip
 from vggtjax.errors import CheckpointError
-from vggtjax.network.quantised import Quantised, as_multiplied, quantise
+from vggtjax.network.checkpoint import save_model
+from vggtjax.network.kernels.quantised import Quantised, as_multiplied, quantise
 from vggtjax.pipeline.run import reconstruct
 
 

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.tiny import tiny_config
+from tests.shared.tiny import tiny_config
 from vggtjax.config import Suppress
 from vggtjax.method.cues import GramCues
+from vggtjax.network.kernels.sampled import early_pairs, frames_alone, sampled_attention, sampled_tokens
 from vggtjax.network.model import forward, init_params
-from vggtjax.network.sampled import early_pairs, frames_alone, sampled_attention, sampled_tokens
 from vggtjax.network.suppression import SuppressedKeys, suppressed_attention
 
 S, GRID, SPECIAL, N, D = 4, (3, 5), 2, 2, 8

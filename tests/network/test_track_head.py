@@ -7,10 +7,10 @@ import pytest
 
 from vggtjax import forward
 from vggtjax.errors import InputError
-from vggtjax.network import track_head
-from vggtjax.network.dpt_head import project_tap
+from vggtjax.network.heads import track_head
+from vggtjax.network.heads.dpt_head import project_tap
+from vggtjax.network.heads.track_head import VIRTUAL_TRACKS, Tracks, predict_tracks
 from vggtjax.network.model import init_params
-from vggtjax.network.track_head import VIRTUAL_TRACKS, Tracks, predict_tracks
 
 
 @pytest.fixture(scope="module")

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from testing.golden import FORWARD, OUTPUTS, TOLERANCE, GoldenPass, spread_error
+from tests.shared.golden import FORWARD, OUTPUTS, TOLERANCE, GoldenPass, spread_error
 from vggtjax import decode_pose, encode, forward
 from vggtjax.network.aggregator import aggregate, identity
-from vggtjax.network.pose import encode_pose
+from vggtjax.network.heads.pose import encode_pose
 
 golden_pass = functools.cache(GoldenPass)
 _forward = jax.jit(forward, static_argnames=("config", "suppress", "outputs"))

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from testing.seeded import seeded_images
+from tests.shared.seeded import seeded_images
 from vggtjax import forward
 from vggtjax.method.cues import GramCues
 from vggtjax.method.mask import cluster_means, upsample

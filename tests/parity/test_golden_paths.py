@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from testing.golden import BFLOAT16, GoldenPass, spread_error
 from tests.parity.test_golden_forward import assert_close
+from tests.shared.golden import BFLOAT16, GoldenPass, spread_error
 from vggtjax import forward
 from vggtjax.config import Suppress
-from vggtjax.network import attention, cpu_attention, gathered_attention, pieces
+from vggtjax.network.kernels import attention, cpu_attention, gathered_attention, pieces
 
 IMPLEMENTATIONS = {
     "in chunks": cpu_attention.attention_in_chunks,

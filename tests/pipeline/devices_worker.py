@@ -31,10 +31,10 @@ if rank is not None:
     jax.distributed.initialize(f"localhost:{sys.argv[3]}", PROCESSES, rank)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-from tests.tiny import tiny_config  # noqa: E402
+from tests.shared.tiny import tiny_config  # noqa: E402
 from vggtjax import infer, load_clip, reconstruct  # noqa: E402
-from vggtjax.checkpoint import Model  # noqa: E402
 from vggtjax.config import MotionConfig  # noqa: E402
+from vggtjax.network.checkpoint import Model  # noqa: E402
 from vggtjax.network.model import init_params  # noqa: E402
 from vggtjax.pipeline.devices import frames_mesh  # noqa: E402
 from vggtjax.pipeline.run import compile_ahead  # noqa: E402

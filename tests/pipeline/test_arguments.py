@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.tiny import tiny_model
+from tests.shared.tiny import tiny_model
 from vggtjax import Options, reconstruct
 from vggtjax.errors import InputError
 from vggtjax.pipeline.run import compile_ahead

@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.tiny import tiny_config
+from tests.shared.tiny import tiny_config
 from vggtjax import infer
-from vggtjax.commands import main as cli
 from vggtjax.errors import InputError
+from vggtjax.interface.commands import main as cli
 from vggtjax.network.model import init_params
 
 ROOT = Path(__file__).parents[2]

@@ -11,19 +11,19 @@ import pytest
 from jax import export
 from jax._src.cudnn import fused_attention_stablehlo as cudnn
 
-from tests.tiny import tiny_config
+from tests.shared.tiny import tiny_config
 from vggtjax.method.algorithm import Clips, run_method, run_passes
-from vggtjax.method.fusion_family import PARTS, start
+from vggtjax.method.fusion.family import PARTS, start
 from vggtjax.method.mask_refinement import cluster_losses, cluster_points
-from vggtjax.network import attention
 from vggtjax.network.aggregator import aggregate
-from vggtjax.network.dpt_head import predict_dense
+from vggtjax.network.heads.dpt_head import predict_dense
+from vggtjax.network.kernels import attention
 from vggtjax.network.model import forward, parameter_shapes
 from vggtjax.network.precision import Compute
 from vggtjax.options import METHODS, Options
-from vggtjax.scenes.textures import load_textures
 from vggtjax.training.data import make_batch
 from vggtjax.training.recipe import Phase
+from vggtjax.training.scenes.textures import load_textures
 
 PLATFORMS = ("cuda", "tpu")
 SIZE, FRAMES = (56, 56), 4

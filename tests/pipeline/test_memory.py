@@ -10,11 +10,11 @@ import pytest
 from PIL import Image
 
 from vggtjax.config import vggt_1b
-from vggtjax.network.cpu_attention import _chunks
+from vggtjax.network.kernels.cpu_attention import _chunks
 from vggtjax.pipeline import memory
-from vggtjax.pretrained.embedded import demo_model
+from vggtjax.pipeline.pretrained.embedded import demo_model
+from vggtjax.pipeline.windows.choice import Planned
 from vggtjax.storage.free_memory import host_room, own_limits
-from vggtjax.windows.choice import Planned
 
 _ROOT = Path(__file__).parents[2]
 _FULL = Planned(vggt_1b(), 5_026_145_968)  # of float32
@@ -45,14 +45,14 @@ def test_so_are_those_of_a_gpu(frames, counted):
 
 @pytest.fixture
 def two_cores(monkeypatch):
-    monkeypatch.setattr("vggtjax.network.cpu_attention.times_for_cores", lambda: 1)
+    monkeypatch.setattr("vggtjax.network.kernels.cpu_attention.times_for_cores", lambda: 1)
 
 
 def test_the_logits_that_more_cores_hold_at_once_are_counted(monkeypatch):
     queries, keys = 4 * (5 + 21 * 37), 32 * (5 + 21 * 37)  # of one of eight devices
     needs, rows = [], []
     for times in (1, 4):
-        monkeypatch.setattr("vggtjax.network.cpu_attention.times_for_cores", lambda times=times: times)
+        monkeypatch.setattr("vggtjax.network.kernels.cpu_attention.times_for_cores", lambda times=times: times)
         rows.append(_chunks(jnp.zeros((queries, 1)), keys).shape[1])
         needs.append(memory.pass_bytes(vggt_1b(), 32, 294, 518, devices=8))
     assert rows == [782, 1564]
@@ -165,7 +165,7 @@ def test_free_memory_is_the_least_of_the_host_and_the_control_groups(tmp_path):
 def test_a_limit_too_low_for_the_libraries_is_met_by_a_sentence(tmp_path):
     """Without the sentence a library that cannot start a thread ends the process."""
     limit = "import resource; resource.setrlimit(resource.RLIMIT_AS, (800_000_000,) * 2)"
-    code = f"{limit}; from vggtjax.commands.main import main; raise SystemExit(main(['info', 'demo']))"
+    code = f"{limit}; from vggtjax.interface.commands.main import main; raise SystemExit(main(['info', 'demo']))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert re.fullmatch(r"vggtjax: ulimit -v leaves this process 0\.\d\d GB, .* ulimit -v unlimited\n", done.stderr)
@@ -176,7 +176,7 @@ def test_a_limit_too_low_for_a_clip_is_met_by_a_sentence(tmp_path):
         Image.new("RGB", (1024, 1024), (number, 0, 0)).save(tmp_path / f"{number}.png")
     code = f"""
 import resource
-from vggtjax.commands.main import main
+from vggtjax.interface.commands.main import main
 from vggtjax import load_model
 load_model("demo")
 used = int(next(line for line in open("/proc/self/status") if line.startswith("VmSize")).split()[1]) * 1024

@@ -5,17 +5,17 @@ import dataclasses
 import numpy as np
 import pytest
 
-from tests.scored_room import room_and_truth
-from tests.tiny import tiny_model
+from tests.shared.scored_room import room_and_truth
+from tests.shared.tiny import tiny_model
 from vggtjax import load_clip
-from vggtjax.evaluation.protocol import score
-from vggtjax.evaluation.truth_at_pixels import TruthAtPixels
 from vggtjax.options import METHODS, Options
 from vggtjax.pipeline.run import reconstruct, with_own_mask
 from vggtjax.pipeline.running import Running
 from vggtjax.pipeline.several import reconstruct_methods
 from vggtjax.progress import StageSeconds
-from vggtjax.reconstruction import Reconstruction
+from vggtjax.research.evaluation.protocol import score
+from vggtjax.research.evaluation.truth_at_pixels import TruthAtPixels
+from vggtjax.results.reconstruction import Reconstruction
 
 
 @pytest.fixture(scope="module")

@@ -3,9 +3,9 @@
 import jax
 import pytest
 
-from vggtjax.commands.models import ModelFiles
-from vggtjax.commands.report import Report
-from vggtjax.network.quantised import Halves, is_stored
+from vggtjax.interface.commands.models import ModelFiles
+from vggtjax.interface.commands.report import Report
+from vggtjax.network.kernels.quantised import Halves, is_stored
 from vggtjax.options import Options
 from vggtjax.pipeline import processor
 from vggtjax.pipeline.processor import choose_dtype

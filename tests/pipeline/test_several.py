@@ -5,8 +5,8 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from tests.moving_ball import moving_ball
-from tests.tiny import tiny_model
+from tests.shared.moving_ball import moving_ball
+from tests.shared.tiny import tiny_model
 from vggtjax import load_clip, reconstruct
 from vggtjax.pipeline.several import reconstruct_methods
 

@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.tiny import tiny_config
+from tests.shared.tiny import tiny_config
 from vggtjax import encode, infer, load_clip, reconstruct
-from vggtjax.checkpoint import Model
 from vggtjax.config import MotionConfig, VGGTConfig
 from vggtjax.errors import CheckpointError, InputError
 from vggtjax.method.passes import first_pass, second_pass
 from vggtjax.network.backbone import ClipBatch
+from vggtjax.network.checkpoint import Model
 from vggtjax.network.model import init_params, parameter_shapes
 from vggtjax.pipeline.fields import assembled_fields
 from vggtjax.pipeline.lengths import padded_frames

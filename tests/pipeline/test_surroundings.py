@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.corner import make_corner, paint
-from tests.tiny import tiny_model
+from tests.shared.corner import make_corner, paint
+from tests.shared.tiny import tiny_model
 from vggtjax import forward, load_clip, load_model, reconstruct
 from vggtjax.method.algorithm import run_method
 from vggtjax.network.model import init_params, parameter_shapes

@@ -28,7 +28,9 @@ _PATHS = {
 }
 # Processes fork from one that has imported all and started nothing: no run imports it again.
 _FORKS = multiprocessing.get_context("forkserver")
-_FORKS.set_forkserver_preload(["vggtjax.batch.many", "vggtjax.commands.main", "tests.proofs.test_kills"])
+_FORKS.set_forkserver_preload(
+    ["vggtjax.pipeline.batch.many", "vggtjax.interface.commands.main", "tests.proofs.test_kills"]
+)
 
 
 class Ended(NamedTuple):

@@ -16,18 +16,18 @@ import pytest
 from PIL import Image
 from safetensors.numpy import save_file
 
-from testing.golden import GOLDEN
-from testing.make_checkpoint import make_checkpoint
-from testing.seeded import seeded_images
-from tests.dataset_files import write_plain
 from tests.proofs.contents import BROKEN, Files, files_below
 from tests.proofs.killed import Ended, Run, changes_of
-from tests.room import make_room
-from tests.tiny import tiny_config, tiny_model
-from vggtjax.checkpoint import save_model
+from tests.shared.dataset_files import write_plain
+from tests.shared.golden import GOLDEN
+from tests.shared.make_checkpoint import make_checkpoint
+from tests.shared.room import make_room
+from tests.shared.seeded import seeded_images
+from tests.shared.tiny import tiny_config, tiny_model
 from vggtjax.clips.truth import Truth
-from vggtjax.commands.main import main
-from vggtjax.pretrained.embedded import demo_clip
+from vggtjax.interface.commands.main import main
+from vggtjax.network.checkpoint import save_model
+from vggtjax.pipeline.pretrained.embedded import demo_clip
 from vggtjax.storage.cache import enable_compilation_cache
 from vggtjax.storage.json_values import read_json
 

@@ -6,7 +6,7 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from tests.room import make_room
+from tests.shared.room import make_room
 
 ROOM = make_room(3)
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tests.room import make_room
+from tests.shared.room import make_room
 from vggtjax.errors import OutputError
 from vggtjax.results import disk
 from vggtjax.results.disk import forecast_bytes

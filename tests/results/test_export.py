@@ -6,16 +6,16 @@ import pytest
 import trimesh
 from PIL import Image
 
-from tests.captures.folders import make_truth, tum
-from tests.room import make_room
+from tests.clips.captures.folders import make_truth, tum
+from tests.shared.room import make_room
 from vggtjax import load_clip
 from vggtjax.errors import InputError, OutputError
 from vggtjax.options import Options
 from vggtjax.pipeline.fields import settings_of
-from vggtjax.reconstruction import Reconstruction
 from vggtjax.results import export
 from vggtjax.results.frame import frame_of
 from vggtjax.results.point_cloud import least_confidence
+from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.saving import Saving
 from vggtjax.storage.trajectories import associate, read_trajectory
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from tests.room import make_room
+from tests.shared.room import make_room
 from vggtjax.results.films import due_frames, film_frames
 
 RED = np.array([220, 40, 30])

@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 
 from tests.results.test_export import files
-from tests.room import make_room
+from tests.shared.room import make_room
 from vggtjax.errors import OutputError
-from vggtjax.reconstruction import Reconstruction
 from vggtjax.results import folder as folders
 from vggtjax.results.archive import ARCHIVE_NAME, saved_names
 from vggtjax.results.folder import check_folder, find_archive, replacing
+from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.saving import NAMES, OPTIONAL_FILES
 from vggtjax.storage.writing import _remove_leftovers
 

@@ -15,7 +15,7 @@ from tests.results.foreign_writers import (
     write_spatialtracker,
 )
 from vggtjax.errors import InputError, ResultError
-from vggtjax.reconstruction import Reconstruction
+from vggtjax.results.reconstruction import Reconstruction
 
 
 @pytest.mark.parametrize("layout", WRITERS)

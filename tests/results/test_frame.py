@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.room import make_room
+from tests.shared.room import make_room
 from vggtjax import Reconstruction, load_clip
 from vggtjax.clips.clip import Clip
 from vggtjax.results.frame import SAME_SURFACE, enlarged_depth, frame_of

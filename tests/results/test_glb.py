@@ -5,10 +5,10 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from tests.glb_files import split_glb
-from tests.room import WALL, make_room
-from vggtjax.exports.write import export_result
+from tests.shared.glb_files import split_glb
+from tests.shared.room import WALL, make_room
 from vggtjax.results import glb, point_cloud
+from vggtjax.results.exports.write import export_result
 from vggtjax.results.glb import _LINEAR, build_scene, glb_bytes, result_scene
 
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.room import make_room
-from vggtjax.reconstruction import Reconstruction
+from tests.shared.room import make_room
 from vggtjax.results import result as results
+from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.storage import arrays as stored
 from vggtjax.storage.arrays import is_mapped, spread_frames, zeros_beside
 
@@ -99,7 +99,7 @@ def test_two_thousand_frames_open_below_200_megabytes(tmp_path):
     code = (
         "import sys\n"
         "from vggtjax.storage.process_memory import process_bytes\n"
-        "from vggtjax.reconstruction import Reconstruction\n"
+        "from vggtjax.results.reconstruction import Reconstruction\n"
         "result = Reconstruction.load(sys.argv[1])\n"
         "assert result.depth.shape == (2000, *map(int, sys.argv[2:]))\n"
         "assert result.depth[1000].max() == 0\n"

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.room import make_room
+from tests.shared.room import make_room
 from vggtjax.errors import InputError, ResultError
-from vggtjax.reconstruction import Reconstruction
+from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.result import FieldOfViewWarning
 from vggtjax.storage import arrays as archive
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.results.test_export import expected_files, files
-from tests.room import make_room
+from tests.shared.room import make_room
 from vggtjax.errors import InputError, OutputError
 from vggtjax.results import export
 from vggtjax.results.folder import replacing

@@ -6,9 +6,9 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from tests.room import make_room
-from vggtjax.reconstruction import Reconstruction
+from tests.shared.room import make_room
 from vggtjax.results import charts
+from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.report import REPORT_NAME, ErrorTable, RunFacts, report_page
 from vggtjax.storage.markup import write_page
 

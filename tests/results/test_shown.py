@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.room import make_room
+from tests.shared.room import make_room
 from vggtjax.results.shown import shown_points
 from vggtjax.results.thinning import Candidates, EvenThinning, places_in_cube
 

@@ -13,7 +13,7 @@ from vggtjax.storage.backend import backend
     ("platforms", "program"),
     [
         ("wrong", "import vggtjax; vggtjax.load_model('demo')"),
-        ("cuda", "from vggtjax.commands.main import main; main(['doctor'])"),
+        ("cuda", "from vggtjax.interface.commands.main import main; main(['doctor'])"),
     ],
 )
 def test_a_platform_that_is_not_there_is_named(platforms, program):

@@ -4,7 +4,7 @@ from http.server import BaseHTTPRequestHandler
 
 import pytest
 
-from tests.servers import empty_memory, served
+from tests.shared.servers import empty_memory, served
 from vggtjax.errors import InputError, OutputError
 from vggtjax.storage import remote
 from vggtjax.storage.remote import check_url, download, exists, is_url, list_url, local_path, read_url, shown, upload

@@ -6,7 +6,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from tests.room import make_room
+from tests.shared.room import make_room
 from vggtjax.errors import ResultError
 from vggtjax.storage.trajectories import Quaternion, read_trajectory, write_trajectory
 

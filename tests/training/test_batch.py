@@ -10,11 +10,11 @@ import pytest
 from scipy import ndimage
 from skimage.measure import label
 
-from tests.generated import QUICK, textures
-from tests.training_runs import CONFIG
+from tests.shared.generated import QUICK, textures
+from tests.shared.training_runs import CONFIG
 from vggtjax.network.aggregator import aggregate, identity
 from vggtjax.network.backbone import encode, patch_grid
-from vggtjax.network.camera_head import predict_pose
+from vggtjax.network.heads.camera_head import predict_pose
 from vggtjax.network.model import init_params
 from vggtjax.network.suppression import Suppression
 from vggtjax.training.data import make_batch

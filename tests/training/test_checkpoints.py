@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.training_runs import SHORT, init_probes
+from tests.shared.training_runs import SHORT, init_probes
 from vggtjax.errors import CheckpointError
 from vggtjax.training.checkpoints import _explaining, latest, restore, save
 from vggtjax.training.recipe import OptimiserConfig

@@ -6,7 +6,7 @@ from pathlib import Path
 
 CODE = """
 import dataclasses, jax, numpy as np
-from tests.training_runs import RECIPE
+from tests.shared.training_runs import RECIPE
 from vggtjax.training.devices import placement
 def placed(*sizes):
     stages = tuple(dataclasses.replace(stage, batch=size) for stage, size in zip(RECIPE.stages, sizes))

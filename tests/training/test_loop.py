@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.training_runs import PROBES, SHORT, TASK, measured
-from vggtjax.checkpoint import read_model
+from tests.shared.training_runs import PROBES, SHORT, TASK, measured
 from vggtjax.errors import InputError, OutputError, VggtjaxError
+from vggtjax.network.checkpoint import read_model
 from vggtjax.network.model import init_params
 from vggtjax.training.checkpoints import latest
 from vggtjax.training.loop import draw_shape, train

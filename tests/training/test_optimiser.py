@@ -8,7 +8,7 @@ import numpy as np
 import optax
 import pytest
 
-from tests.training_runs import RECIPE
+from tests.shared.training_runs import RECIPE
 from vggtjax.training.optimiser import make_optimiser as make_typed_optimiser
 from vggtjax.training.optimiser import make_schedule
 from vggtjax.training.recipe import OptimiserConfig, Recipe

@@ -8,14 +8,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.training_runs import RECIPE
+from tests.shared.training_runs import RECIPE
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
-from vggtjax.network.dpt_head import DENSE_HEADS
-from vggtjax.scenes import SceneConfig, load_textures
+from vggtjax.network.heads.dpt_head import DENSE_HEADS
 from vggtjax.training.data import make_batch
 from vggtjax.training.objective import LossWeights, init_probes, objective
 from vggtjax.training.recipe import Phase, Recipe, read_recipe
+from vggtjax.training.scenes import SceneConfig, load_textures
 from vggtjax.training.state import loss_and_gradient, state_shapes
 
 PHASE = {"steps": 5, "batch": 2, "frames": [2, 4], "height": 28, "width": 42}

@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.tiny import tiny_model
-from tests.training_runs import RECIPE, init_probes
+from tests.shared.tiny import tiny_model
+from tests.shared.training_runs import RECIPE, init_probes
 from vggtjax.config import MotionConfig
 from vggtjax.errors import CheckpointError, InputError
 from vggtjax.network.backbone import encode
 from vggtjax.network.model import forward
-from vggtjax.pretrained.embedded import demo_model
+from vggtjax.pipeline.pretrained.embedded import demo_model
 from vggtjax.training.recipe import Recipe, Start, read_recipe
 from vggtjax.training.start import adapted, start_params
 from vggtjax.training.state import initial_state

@@ -5,16 +5,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.training_runs import RECIPE, SHORT, TASK, init_probes, make_batch, objective, train_step
-from vggtjax.checkpoint import read_model, save_model
+from tests.shared.training_runs import RECIPE, SHORT, TASK, init_probes, make_batch, objective, train_step
 from vggtjax.errors import CheckpointError
+from vggtjax.network.checkpoint import read_model, save_model
 from vggtjax.network.model import init_params
-from vggtjax.scenes import load_textures
 from vggtjax.training.data import make_batch as scenes_batch
 from vggtjax.training.objective import LossWeights
 from vggtjax.training.objective import init_probes as scenes_probes
 from vggtjax.training.objective import objective as scenes_objective
 from vggtjax.training.recipe import OptimiserConfig, Phase
+from vggtjax.training.scenes import load_textures
 from vggtjax.training.state import initial_state
 
 

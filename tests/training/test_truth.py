@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.generated import DYNAMIC, QUICK, clips
-from vggtjax.network.pose import decode_pose
-from vggtjax.scenes import SyntheticClip
+from tests.shared.generated import DYNAMIC, QUICK, clips
+from vggtjax.network.heads.pose import decode_pose
 from vggtjax.training.matching import MatchLoss, match_loss
+from vggtjax.training.scenes import SyntheticClip
 from vggtjax.training.truth import OCCLUDED, Matches, match_counts, matches, targets
 
 PATCH = 4

@@ -13,15 +13,15 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int, UInt8
 
-from vggtjax.captures.frames import CaptureFrames
+from vggtjax.clips.captures.frames import CaptureFrames
+from vggtjax.clips.media.images import ImageFiles
+from vggtjax.clips.media.sampling import Sampling, Source
 from vggtjax.clips.preprocessing import Fit, Fitter, Framing, Mode
 from vggtjax.clips.shots import ShotWatch, warn_of_dark
 from vggtjax.clips.sources import ClipSource, open_source
 from vggtjax.clips.still import same_picture
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import ClipError, InputError, one_line
-from vggtjax.media.images import ImageFiles
-from vggtjax.media.sampling import Sampling, Source
 from vggtjax.progress import Progress, no_progress
 
 logger = logging.getLogger(__name__)
@@ -120,8 +120,8 @@ def load_clip(
         source: a folder of images, a pattern such as "frames/*.png", an image or video file, a list of image paths,
             a list of PIL images or of arrays [H, W, 3], or one array [S, H, W, 3] (uint8, uint16, or floating point
             in [0, 1]; 8 bits are kept, but floating point stays as it is where it is not resized), or a capture of an
-            app (see `vggtjax.captures.find_capture`), whose frames are undistorted where it has coefficients of its
-            lens; or what `open_source` returned.
+            app (see `vggtjax.clips.captures.find_capture`), whose frames are undistorted where it has coefficients of
+            its lens; or what `open_source` returned.
             Files of folders and patterns are taken in natural order (frame_2 before frame_10), hidden files and files
             that are not images left out; a list keeps its order.
         model: what `load_model` returned: its own size and patch size are taken, but `size` wins where it is given.

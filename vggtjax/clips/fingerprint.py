@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from vggtjax.media.arrays import ArrayFrames
-from vggtjax.media.images import ImageFiles
-from vggtjax.media.sampling import Source
+from vggtjax.clips.media.arrays import ArrayFrames
+from vggtjax.clips.media.images import ImageFiles
+from vggtjax.clips.media.sampling import Source
 
 _SAMPLE = 4096  # bytes from the start and from the end of a file
 

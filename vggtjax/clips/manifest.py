@@ -7,9 +7,9 @@ from collections.abc import Collection, Iterator
 from pathlib import Path, PurePath
 from typing import Any, TypeAlias
 
+from vggtjax.clips.media.images import is_image_name
+from vggtjax.clips.media.video import is_video_name
 from vggtjax.errors import ClipError, check_extra, one_line, reading
-from vggtjax.media.images import is_image_name
-from vggtjax.media.video import is_video_name
 from vggtjax.storage.csv_file import read_csv
 from vggtjax.storage.json_values import parse_json
 from vggtjax.storage.remote import is_url, local_path, url_name

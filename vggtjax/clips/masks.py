@@ -15,13 +15,10 @@ import numpy as np
 from jaxtyping import Bool
 from PIL import Image, ImageOps
 
-from vggtjax.captures.frames import CaptureFrames
-from vggtjax.captures.lens import Undistortion
+from vggtjax.clips.captures.frames import CaptureFrames
+from vggtjax.clips.captures.lens import Undistortion
 from vggtjax.clips.clip import Clip
-from vggtjax.clips.sources import open_source
-from vggtjax.clips.truth import at_clip_pixels
-from vggtjax.errors import ClipError, InputError, reading
-from vggtjax.media.images import (
+from vggtjax.clips.media.images import (
     UNREADABLE,
     ImageFiles,
     check_pixels,
@@ -31,7 +28,10 @@ from vggtjax.media.images import (
     stored_orientation,
     turned,
 )
-from vggtjax.media.video import VideoFile
+from vggtjax.clips.media.video import VideoFile
+from vggtjax.clips.sources import open_source
+from vggtjax.clips.truth import at_clip_pixels
+from vggtjax.errors import ClipError, InputError, reading
 from vggtjax.storage.file_digest import file_digest
 
 logger = logging.getLogger(__name__)

@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from vggtjax.clips.media.images import UNREADABLE, check_pixels, known_formats
+from vggtjax.clips.media.video import is_video_name
 from vggtjax.errors import ClipError
-from vggtjax.media.images import UNREADABLE, check_pixels, known_formats
-from vggtjax.media.video import is_video_name
 
 # Words in names of pictures that belong to a frame and are none; of frames beside them; of either.
 _BESIDE = re.compile(

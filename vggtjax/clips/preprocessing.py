@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from PIL import Image
 
+from vggtjax.clips.media.sampling import Frame
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import ClipError, InputError, check_choice, whole_number
-from vggtjax.media.sampling import Frame
 
 Mode = Literal["crop", "pad"]
 

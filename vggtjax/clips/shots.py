@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 from PIL import Image
 
+from vggtjax.clips.media.sampling import Frame, Sampling, Source
 from vggtjax.errors import ClipError
-from vggtjax.media.sampling import Frame, Sampling, Source
 
 logger = logging.getLogger(__name__)
 

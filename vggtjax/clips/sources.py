@@ -13,19 +13,19 @@ from typing import Any, TypeAlias
 import numpy as np
 from PIL import Image, ImageOps
 
-from vggtjax.captures.files import folder_name
-from vggtjax.captures.frames import CaptureFrames
-from vggtjax.captures.lens import check_no_fisheye
-from vggtjax.captures.table import RECORD3D_SUFFIX, capture_kind, find_capture
+from vggtjax.clips.captures.files import folder_name
+from vggtjax.clips.captures.frames import CaptureFrames
+from vggtjax.clips.captures.lens import check_no_fisheye
+from vggtjax.clips.captures.table import RECORD3D_SUFFIX, capture_kind, find_capture
 from vggtjax.clips.manifest import MOST_BYTES, is_manifest, read_manifest, source_name
+from vggtjax.clips.media.animation import Animation, is_animation
+from vggtjax.clips.media.arrays import ArrayFrames
+from vggtjax.clips.media.images import ImageFiles, is_image_name, to_rgb
+from vggtjax.clips.media.order import in_order
+from vggtjax.clips.media.sampling import Source
+from vggtjax.clips.media.video import VideoFile, is_video_name
 from vggtjax.clips.mixture import check_colours, check_frames, odd_ones
 from vggtjax.errors import ClipError, InputError, reading
-from vggtjax.media.animation import Animation, is_animation
-from vggtjax.media.arrays import ArrayFrames
-from vggtjax.media.images import ImageFiles, is_image_name, to_rgb
-from vggtjax.media.order import in_order
-from vggtjax.media.sampling import Source
-from vggtjax.media.video import VideoFile, is_video_name
 from vggtjax.storage.remote import check_url, download, is_url, list_url, local_path, shown, url_name
 
 _NUMBERED = re.compile(r"%0?(\d?)d")  # a number of at least so many digits, in C's words

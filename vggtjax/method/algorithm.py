@@ -19,18 +19,18 @@ from jaxtyping import Array, Bool, Float, Int
 from vggtjax.config import VGGTConfig, Witness
 from vggtjax.errors import InputError
 from vggtjax.method.assembly import Assembly, FusionRule, as_tree, assemble, check_fuses
-from vggtjax.method.matched_mask import Mined
-from vggtjax.method.matched_motion import FEWEST_FRAMES
+from vggtjax.method.matching.matched_mask import Mined
+from vggtjax.method.matching.matched_motion import FEWEST_FRAMES
+from vggtjax.method.matching.witnesses import Seen
 from vggtjax.method.passes import Passes, first_pass, mine, mine_soft, only, second_pass, track_from
 from vggtjax.method.soft_mask import SoftMasking
-from vggtjax.method.witnesses import Seen
 from vggtjax.network.backbone import ClipBatch, encode
-from vggtjax.network.frames import BY_FRAME, REPLICATED, Frames
 from vggtjax.network.given import as_array, as_images
+from vggtjax.network.heads.track_head import Tracks
+from vggtjax.network.kernels.frames import BY_FRAME, REPLICATED, Frames
 from vggtjax.network.layers import Params
 from vggtjax.network.model import Predictions
 from vggtjax.network.precision import Compute
-from vggtjax.network.track_head import Tracks
 from vggtjax.options import Options
 
 Images = Float[Array, "B S H W 3"]

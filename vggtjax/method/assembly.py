@@ -12,12 +12,12 @@ from jaxtyping import Array, Float
 
 from vggtjax.cameras import Cameras
 from vggtjax.errors import InputError
-from vggtjax.method.fusion import fuse_depth, replace_depth, scale_between
-from vggtjax.method.fusion_family import FusionParams, Observations, fuse, paper_rule
-from vggtjax.method.fusion_inputs import observe
+from vggtjax.method.fusion.family import FusionParams, Observations, fuse, paper_rule
+from vggtjax.method.fusion.inputs import observe
+from vggtjax.method.fusion.rule import fuse_depth, replace_depth, scale_between
 from vggtjax.method.passes import Passes, present
-from vggtjax.network.frames import Frames
-from vggtjax.network.pose import decode_pose
+from vggtjax.network.heads.pose import decode_pose
+from vggtjax.network.kernels.frames import Frames
 from vggtjax.options import METHODS, find_method
 
 Depth = Float[Array, "B S H W"]

@@ -17,8 +17,8 @@ from jaxtyping import Array, Float, Int
 
 from vggtjax.config import Cue, Gram, MotionConfig
 from vggtjax.errors import check_choice
-from vggtjax.network.frames import Frames
-from vggtjax.network.in_place import added_if
+from vggtjax.network.kernels.frames import Frames
+from vggtjax.network.kernels.in_place import added_if
 from vggtjax.network.precision import products, upcast
 
 FRAMES_AT_ONCE = {"cpu": 4, "default": 16}  # whose similarities are in memory, by platform

@@ -18,8 +18,8 @@ from jaxtyping import Array, Bool, Float, Int
 from vggtjax.cameras import unproject
 from vggtjax.errors import InputError
 from vggtjax.method.clustering import kmeans, nearest_centre
+from vggtjax.network.heads.sampling import bilinear
 from vggtjax.network.precision import full_precision
-from vggtjax.network.sampling import bilinear
 from vggtjax.progress import Progress, no_progress
 
 CLUSTERS = 30

@@ -14,17 +14,17 @@ from vggtjax.clips.still import same_picture
 from vggtjax.config import Gram, MotionConfig, Suppress, Threshold, VGGTConfig, Witness
 from vggtjax.errors import InputError
 from vggtjax.method.mask import dynamic_tokens, mine_mask
-from vggtjax.method.matched_mask import Mined, mine_matched_mask
-from vggtjax.method.matches import Matches
+from vggtjax.method.matching.matched_mask import Mined, mine_matched_mask
+from vggtjax.method.matching.matches import Matches
+from vggtjax.method.matching.witnesses import Seen, Witnesses
 from vggtjax.method.soft_mask import SoftMasking, soft_pixels
-from vggtjax.method.witnesses import Seen, Witnesses
 from vggtjax.network.backbone import ClipBatch, patch_grid
-from vggtjax.network.frames import Frames, with_frames
+from vggtjax.network.heads.track_head import Tracks
+from vggtjax.network.kernels.frames import Frames, with_frames
 from vggtjax.network.layers import Params
 from vggtjax.network.model import FIELDS, Predictions, predict
 from vggtjax.network.precision import Compute
 from vggtjax.network.suppression import Suppression
-from vggtjax.network.track_head import Tracks
 
 _Value = TypeVar("_Value")
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from vggtjax.config import MotionConfig, Threshold, VGGTConfig
-from vggtjax.method.fusion_family import soft_mask
+from vggtjax.method.fusion.family import soft_mask
 from vggtjax.method.mask import CONSTANT, find_threshold, upsample
 
 

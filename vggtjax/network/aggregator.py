@@ -15,12 +15,12 @@ from jaxtyping import Array, Float, Int
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.network.block import Block, apply_block, with_remat_policy
-from vggtjax.network.frames import Frames
-from vggtjax.network.in_place import replaced_if
+from vggtjax.network.kernels.frames import Frames
+from vggtjax.network.kernels.in_place import replaced_if
+from vggtjax.network.kernels.sampled import early_pairs, frames_alone, sampled_attention
 from vggtjax.network.layers import Params, apply, stack
 from vggtjax.network.precision import Compute, full_precision, upcast
 from vggtjax.network.rope import rope_table
-from vggtjax.network.sampled import early_pairs, frames_alone, sampled_attention
 from vggtjax.network.suppression import Attend, SuppressedKeys, Suppression, suppressed_attention
 
 REGISTERS = 4

@@ -10,10 +10,10 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Array, Bool, Float
 
-from vggtjax.network.cpu_attention import ATTENDED
+from vggtjax.network.kernels.cpu_attention import ATTENDED
+from vggtjax.network.kernels.pieces import map_chunks, map_chunks_in_place
+from vggtjax.network.kernels.quantised import as_multiplied
 from vggtjax.network.layers import MLP, Dense, DType, LayerNorm, Params, apply
-from vggtjax.network.pieces import map_chunks, map_chunks_in_place
-from vggtjax.network.quantised import as_multiplied
 from vggtjax.network.rope import Rope, apply_rope
 from vggtjax.network.suppression import Attend, SuppressedKeys, suppressed_attention
 

@@ -12,7 +12,7 @@ from flax import linen as nn
 from flax.linen.dtypes import promote_dtype
 from jaxtyping import Array, Float
 
-from vggtjax.network.cpu_convolution import same_convolution
+from vggtjax.network.kernels.cpu_convolution import same_convolution
 from vggtjax.network.precision import upcast
 
 Params = dict[str, Any]

@@ -17,14 +17,14 @@ from vggtjax.config import Suppress, VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.network.aggregator import SPECIAL_TOKENS, Accumulator, Aggregator, aggregate, identity
 from vggtjax.network.backbone import Backbone, ClipBatch, encode, patch_grid
-from vggtjax.network.camera_head import ITERATIONS, CameraHead, predict_pose
-from vggtjax.network.dpt_head import DENSE_HEADS, DenseHead, predict_dense, project_tap
-from vggtjax.network.frames import Frames
 from vggtjax.network.given import as_array, as_images, check_floats
+from vggtjax.network.heads.camera_head import ITERATIONS, CameraHead, predict_pose
+from vggtjax.network.heads.dpt_head import DENSE_HEADS, DenseHead, predict_dense, project_tap
+from vggtjax.network.heads.track_head import TrackHead, check_track_size, predict_tracks, smallest_side
+from vggtjax.network.kernels.frames import Frames
 from vggtjax.network.layers import Params
 from vggtjax.network.precision import Compute, full_precision
 from vggtjax.network.suppression import Suppression
-from vggtjax.network.track_head import TrackHead, check_track_size, predict_tracks, smallest_side
 
 # The modules of all heads in the parameter tree, and the fields of `Predictions` that they fill.
 HEADS = {

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from vggtjax.config import Attention, ComputeDType, Precision
 from vggtjax.errors import InputError, check_choice
-from vggtjax.network.frames import Frames
+from vggtjax.network.kernels.frames import Frames
 
 _Parameters = ParamSpec("_Parameters")
 _Result = TypeVar("_Result")

@@ -14,8 +14,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vggtjax.config import Suppress
 from vggtjax.errors import InputError, check_choice, whole_number
-from vggtjax.network.frames import Frames
-from vggtjax.network.gathered_attention import gathered_attention
+from vggtjax.network.kernels.frames import Frames
+from vggtjax.network.kernels.gathered_attention import gathered_attention
 
 
 @partial(

@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import UInt8
 
 from vggtjax.options import Options
+from vggtjax.pipeline.refinement.consistent import consistent_depth
+from vggtjax.pipeline.refinement.dense import KNOWN, PREDICTED
+from vggtjax.pipeline.refinement.pixel_mask import mask_by_pixels
+from vggtjax.pipeline.refinement.refine import refine_with_points, warn_of_kept
 from vggtjax.progress import OnStage, no_stage
-from vggtjax.refinement.consistent import consistent_depth
-from vggtjax.refinement.dense import KNOWN, PREDICTED
-from vggtjax.refinement.pixel_mask import mask_by_pixels
-from vggtjax.refinement.refine import refine_with_points, warn_of_kept
 from vggtjax.results.result import Result
 
 R = TypeVar("R", bound=Result)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from vggtjax.checkpoint import Model
 from vggtjax.clips.queries import Queries
 from vggtjax.errors import InputError, one_line
-from vggtjax.known.options import KnownGeometry
+from vggtjax.network.checkpoint import Model
 from vggtjax.options import Options
+from vggtjax.pipeline.known.options import KnownGeometry
 from vggtjax.pipeline.running import Running
 
 _KINDS: dict[str, tuple[tuple[type, ...], str]] = {

@@ -11,7 +11,7 @@ from jax.sharding import Mesh
 from jaxtyping import Array
 
 from vggtjax.errors import InputError, whole_number
-from vggtjax.network.frames import AXIS, BY_FRAME, REPLICATED, Frames
+from vggtjax.network.kernels.frames import AXIS, BY_FRAME, REPLICATED, Frames
 from vggtjax.pipeline.lengths import shared_length
 from vggtjax.storage.backend import backend
 

@@ -8,18 +8,18 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from vggtjax.captures.frames import CaptureFrames
-from vggtjax.checkpoint import Model
+from vggtjax.clips.captures.frames import CaptureFrames
 from vggtjax.clips.clip import Clip
 from vggtjax.clips.fingerprint import fingerprint
+from vggtjax.clips.media.images import ImageFiles
 from vggtjax.clips.queries import Queries
 from vggtjax.clips.shots import looks_of
-from vggtjax.media.images import ImageFiles
 from vggtjax.method.assembly import Assembly, FusionRule
-from vggtjax.method.fusion_file import fusion_digest
+from vggtjax.method.fusion.file import fusion_digest
 from vggtjax.method.passes import Passes
+from vggtjax.network.checkpoint import Model
+from vggtjax.network.heads.track_head import Tracks
 from vggtjax.network.model import Predictions
-from vggtjax.network.track_head import Tracks
 from vggtjax.options import Options
 from vggtjax.results.report import versions
 

@@ -13,15 +13,15 @@ from jax.core import Tracer
 from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
-from vggtjax.checkpoint import Model
 from vggtjax.config import MotionConfig, VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.method.algorithm import Clips, Masks, check_masks, compute_by, given_masks, run_method
 from vggtjax.method.assembly import Assembly, FusionRule, as_tree
 from vggtjax.method.passes import Passes
 from vggtjax.method.soft_mask import SoftMasking
-from vggtjax.network.frames import Frames
+from vggtjax.network.checkpoint import Model
 from vggtjax.network.given import as_images
+from vggtjax.network.kernels.frames import Frames
 from vggtjax.network.layers import Params
 from vggtjax.options import Options
 from vggtjax.pipeline.devices import by_frame_padded, replicate

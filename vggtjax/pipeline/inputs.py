@@ -8,16 +8,16 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool
 
-from vggtjax.captures.frames import CaptureFrames
-from vggtjax.checkpoint import Model
+from vggtjax.clips.captures.frames import CaptureFrames
 from vggtjax.clips.clip import Clip, load_clip
 from vggtjax.clips.masks import load_masks, masks_at_clip_pixels
 from vggtjax.clips.preprocessing import Framing
 from vggtjax.clips.queries import Queries
 from vggtjax.clips.sources import ClipSource
 from vggtjax.errors import InputError
-from vggtjax.known.given import Given, check_readable, read_known
-from vggtjax.known.options import KnownGeometry
+from vggtjax.network.checkpoint import Model
+from vggtjax.pipeline.known.given import Given, check_readable, read_known
+from vggtjax.pipeline.known.options import KnownGeometry
 from vggtjax.progress import OnStage
 
 GivenMasks = Bool[np.ndarray, "S h w"] | str | Path | Literal[False]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from jax.sharding import Mesh
 
-from vggtjax.network.frames import Frames
+from vggtjax.network.kernels.frames import Frames
 
 _DIGITS = 4  # significant binary digits of padded lengths: no clip gets longer by more than an eighth
 

@@ -18,9 +18,9 @@ import jax
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.network.aggregator import SPECIAL_TOKENS
-from vggtjax.network.cpu_attention import LOGITS_OF_ALL_HEADS, chunk_count
-from vggtjax.network.dpt_head import HIDDEN, PIXELS_AT_ONCE
-from vggtjax.network.gathered_attention import GATHERED_AT_ONCE
+from vggtjax.network.heads.dpt_head import HIDDEN, PIXELS_AT_ONCE
+from vggtjax.network.kernels.cpu_attention import LOGITS_OF_ALL_HEADS, chunk_count
+from vggtjax.network.kernels.gathered_attention import GATHERED_AT_ONCE
 from vggtjax.options import Method, find_method
 from vggtjax.storage.free_memory import Room, host_room
 

@@ -12,18 +12,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from vggtjax.checkpoint import Model, check_finite
 from vggtjax.clips.clip import Clip
 from vggtjax.clips.queries import Queries
 from vggtjax.clips.sources import ClipSource
 from vggtjax.errors import InputError, ResultError, device_memory_errors
-from vggtjax.known.apply import apply_known, scaled
-from vggtjax.known.options import KnownGeometry
 from vggtjax.method.algorithm import Clips, compute_by, run_method
 from vggtjax.method.assembly import Assembly, FusionRule, as_tree, check_fuses
 from vggtjax.method.mask_refinement import refine_masks
 from vggtjax.method.passes import Passes
-from vggtjax.network.frames import BY_FRAME, REPLICATED, Frames
+from vggtjax.network.checkpoint import Model, check_finite
+from vggtjax.network.kernels.frames import BY_FRAME, REPLICATED, Frames
 from vggtjax.network.surroundings import own_settings
 from vggtjax.options import Options
 from vggtjax.pipeline.agreement import agree_with_pixels, agrees_with_pixels
@@ -38,14 +36,16 @@ from vggtjax.pipeline.fields import (
     track_fields,
 )
 from vggtjax.pipeline.inputs import GivenMasks, Inputs, read_inputs
+from vggtjax.pipeline.known.apply import apply_known, scaled
+from vggtjax.pipeline.known.options import KnownGeometry
 from vggtjax.pipeline.lengths import padded_frames, shared_length
+from vggtjax.pipeline.refinement.refine import check_refinement
 from vggtjax.pipeline.running import Running, changed
 from vggtjax.pipeline.steps import Compile, Execute, StageMemory
 from vggtjax.progress import OnStage, Progress
-from vggtjax.reconstruction import Reconstruction
-from vggtjax.refinement.refine import check_refinement
 from vggtjax.results.no_mask import without_mask
 from vggtjax.results.not_finite import warn_of_not_finite
+from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.storage.cache import hint_compilation_cache
 
 _LESS_MEMORY = (

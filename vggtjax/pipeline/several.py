@@ -7,12 +7,12 @@ import warnings
 from collections.abc import Sequence
 from typing import Any
 
-from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip
 from vggtjax.config import MotionConfig
 from vggtjax.errors import InputError
 from vggtjax.method.assembly import FusionRule, as_tree, assemble, check_fuses
-from vggtjax.method.fusion_file import fusion_digest
+from vggtjax.method.fusion.file import fusion_digest
+from vggtjax.network.checkpoint import Model
 from vggtjax.options import Options
 from vggtjax.pipeline.agreement import agree_with_pixels
 from vggtjax.pipeline.arguments import check_kinds
@@ -21,8 +21,8 @@ from vggtjax.pipeline.run import refined, with_own_mask
 from vggtjax.pipeline.running import Running
 from vggtjax.pipeline.steps import Execute
 from vggtjax.progress import OnStage, no_stage
-from vggtjax.reconstruction import Reconstruction
 from vggtjax.results.no_mask import without_mask
+from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.result import FieldOfViewWarning
 
 

@@ -11,10 +11,10 @@ from jaxtyping import Float32, Int32, UInt8
 from vggtjax.cameras import FRUSTUM_EDGES, Cameras, frustum_corners, project
 from vggtjax.errors import InputError, check_choice, whole_number
 from vggtjax.progress import Progress, no_progress
-from vggtjax.rendering.film import write_film as write_film
-from vggtjax.rendering.paths import fitted_intrinsics, follow, middle_camera, orbit
-from vggtjax.rendering.splats import BACKGROUND, Splats, draw_splats
 from vggtjax.results.frame import PLAIN_RATE
+from vggtjax.results.rendering.film import write_film as write_film
+from vggtjax.results.rendering.paths import fitted_intrinsics, follow, middle_camera, orbit
+from vggtjax.results.rendering.splats import BACKGROUND, Splats, draw_splats
 from vggtjax.results.result import Result
 from vggtjax.results.shown import ShownPoints, shown_points
 from vggtjax.results.widths import point_widths

@@ -33,8 +33,8 @@ from PIL import Image
 
 from vggtjax.cameras import Cameras, world_from_camera
 from vggtjax.clips.masks import read_mask
+from vggtjax.clips.media.images import read_image
 from vggtjax.errors import InputError, ResultError, check_choice, reading
-from vggtjax.media.images import read_image
 from vggtjax.results.foreign_cameras import Posed, text_cameras
 from vggtjax.results.frame import ResultFrame
 from vggtjax.storage.arrays import SIZE_LIMIT, Header, read_array, read_arrays, read_headers

@@ -16,8 +16,8 @@ from jaxtyping import Bool, Float32, Float64, Int, Int64, UInt8
 
 from vggtjax.cameras import FIELD_OF_VIEW_RANGE, camera_centres, clamp_intrinsics, unproject, world_from_camera
 from vggtjax.errors import ResultError
-from vggtjax.method.instances import find_instances
 from vggtjax.options import METHODS
+from vggtjax.results.instances import find_instances
 from vggtjax.storage.arrays import is_mapped, zeros_beside
 
 _TIME = re.compile(r"\d{1,18}\.\d{1,18}")  # in seconds, as a frame's name

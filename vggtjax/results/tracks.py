@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, ImageDraw
 
-from vggtjax.rendering.film import mp4_codec, write_film
 from vggtjax.results.colors import hues
 from vggtjax.results.grid import Row, draw_grid, fitted
+from vggtjax.results.rendering.film import mp4_codec, write_film
 from vggtjax.results.result import Result
 
 SEEN = 0.5  # visibility from which a point is drawn filled

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from vggtjax.config import Suppress, VGGTConfig
 from vggtjax.network.suppression import Suppression
-from vggtjax.scenes.render import SyntheticClip
+from vggtjax.training.scenes.render import SyntheticClip
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=("clips", "regions", "pairs"), meta_fields=("suppress",))

@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from vggtjax.scenes.render import SyntheticClip, generate
-from vggtjax.scenes.textures import Textures
 from vggtjax.training.batch import Batch
 from vggtjax.training.recipe import Phase
 from vggtjax.training.regions import random_regions
+from vggtjax.training.scenes.render import SyntheticClip, generate
+from vggtjax.training.scenes.textures import Textures
 
 GREY = 0.1  # share of clips without colour
 IN_ORDER = 0.5  # share of clips with frames in order of time

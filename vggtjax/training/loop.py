@@ -17,9 +17,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from vggtjax.checkpoint import Model
+from vggtjax.network.checkpoint import Model
 from vggtjax.network.layers import Params
-from vggtjax.scenes.textures import load_textures
 from vggtjax.storage.writing import locked_folder
 from vggtjax.training.data import make_batch as make_scene_batch
 from vggtjax.training.devices import placement
@@ -29,6 +28,7 @@ from vggtjax.training.objective import objective as scene_objective
 from vggtjax.training.options import RunOptions
 from vggtjax.training.recipe import Phase, Recipe
 from vggtjax.training.run import Run, labels_of
+from vggtjax.training.scenes.textures import load_textures
 from vggtjax.training.start import adapted
 from vggtjax.training.state import Metrics, Objective, TrainingState, apply_gradient, loss_and_gradient
 

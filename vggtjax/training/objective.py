@@ -12,11 +12,11 @@ from jaxtyping import Array, Bool, Float
 from vggtjax.config import VGGTConfig
 from vggtjax.network.aggregator import SPECIAL_TOKENS, aggregate
 from vggtjax.network.backbone import encode, patch_grid
-from vggtjax.network.camera_head import predict_pose
-from vggtjax.network.dpt_head import DENSE_HEADS, predict_dense, project_tap
+from vggtjax.network.heads.camera_head import predict_pose
+from vggtjax.network.heads.dpt_head import DENSE_HEADS, predict_dense, project_tap
+from vggtjax.network.heads.pose import quaternion_to_matrix
 from vggtjax.network.layers import LayerNorm, Params, apply
 from vggtjax.network.model import HEADS
-from vggtjax.network.pose import quaternion_to_matrix
 from vggtjax.network.precision import Compute, full_precision
 from vggtjax.storage.json_values import Natural, NotNegative, check_fields
 from vggtjax.training.batch import Batch

@@ -14,7 +14,6 @@ from msgspec import Meta
 from vggtjax.config import Suppress, VGGTConfig
 from vggtjax.errors import InputError, whole_number
 from vggtjax.network.model import HEADS
-from vggtjax.scenes.config import SceneConfig, Side
 from vggtjax.storage.json_values import (
     Count,
     Natural,
@@ -26,6 +25,7 @@ from vggtjax.storage.json_values import (
     read_json,
 )
 from vggtjax.training.objective import LossWeights
+from vggtjax.training.scenes.config import SceneConfig, Side
 
 _MOST_FILE_BYTES = 1 << 20
 Decay = Annotated[float, Meta(ge=0, lt=1)]

@@ -11,8 +11,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from vggtjax.checkpoint import Model, numpy_dtype, save_model
 from vggtjax.errors import CheckpointError, VggtjaxError
+from vggtjax.network.checkpoint import Model, numpy_dtype, save_model
 from vggtjax.network.layers import Params
 from vggtjax.network.model import HEADS
 from vggtjax.storage.writing import writing

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 
-from vggtjax.checkpoint import Model
 from vggtjax.errors import CheckpointError, InputError
 from vggtjax.network.backbone import patch_positions
+from vggtjax.network.checkpoint import Model
 from vggtjax.network.layers import Params
 from vggtjax.network.model import init_params
 from vggtjax.training.recipe import Recipe

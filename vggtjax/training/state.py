@@ -12,7 +12,7 @@ import optax
 from flax.traverse_util import flatten_dict
 from jaxtyping import Array, Float, Int
 
-from vggtjax.checkpoint import check_parameters
+from vggtjax.network.checkpoint import check_parameters
 from vggtjax.network.layers import Params
 from vggtjax.network.model import parameter_shapes
 from vggtjax.training.optimiser import join, make_optimiser, make_schedule, split

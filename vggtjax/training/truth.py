@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from vggtjax.cameras import unproject
-from vggtjax.network.pose import encode_pose
+from vggtjax.network.heads.pose import encode_pose
 from vggtjax.network.precision import full_precision
-from vggtjax.scenes.render import SyntheticClip
-from vggtjax.scenes.scene import compose, invert
+from vggtjax.training.scenes.render import SyntheticClip
+from vggtjax.training.scenes.scene import compose, invert
 
 OCCLUDED = 0.03  # largest relative depth of a visible point behind the depth of its target pixel
 

@@ -10,21 +10,21 @@ from unittest.mock import patch
 
 import numpy as np
 
-from tests.dataset_files import npy
 from tests.fuzz.cases import Reader
 from tests.fuzz.rows.strangers import file
-from tests.room import make_room
-from vggtjax.batch.contact import _told as read_card
-from vggtjax.batch.destination import SETTINGS_NAME, LocalFolder, RemoteFolder
-from vggtjax.evaluation.page import is_report
-from vggtjax.reconstruction import Reconstruction
+from tests.shared.dataset_files import npy
+from tests.shared.room import make_room
+from vggtjax.pipeline.batch.contact import _told as read_card
+from vggtjax.pipeline.batch.destination import SETTINGS_NAME, LocalFolder, RemoteFolder
+from vggtjax.pipeline.windows.loops import find_loops
+from vggtjax.pipeline.windows.store import WindowStore
+from vggtjax.pipeline.windows.whole import window_name
+from vggtjax.research.evaluation.page import is_report
 from vggtjax.results.archive import saved_names
-from vggtjax.scenes.dataset import read_index
+from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.storage import arrays
 from vggtjax.training.metrics import read_metrics
-from vggtjax.windows.loops import find_loops
-from vggtjax.windows.store import WindowStore
-from vggtjax.windows.whole import window_name
+from vggtjax.training.scenes.dataset import read_index
 
 
 def _archive(folder: Path) -> Path:
@@ -78,8 +78,8 @@ _SETTINGS = {"model": "tiny", "method": "vggt", "size": 28, "outputs": ["depth",
 def _read_remote_settings(path: Path) -> None:
     """Read settings as those of a batch at a URL, whose server gives what the file holds."""
     content = path.read_bytes() if path.is_file() and not path.is_symlink() else None
-    given = patch("vggtjax.batch.destination.read_url", return_value=content)
-    with given, patch("vggtjax.batch.destination.write_url"):
+    given = patch("vggtjax.pipeline.batch.destination.read_url", return_value=content)
+    with given, patch("vggtjax.pipeline.batch.destination.write_url"):
         RemoteFolder("s3://bucket/results").begin(_SETTINGS)
 
 

@@ -16,27 +16,27 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from PIL import Image
 
-from tests.captures import folders
-from tests.dataset_files import depth_png, dpt, npy, png, write
-from tests.evaluation.datasets.test_dycheck import dycheck_folder
-from tests.evaluation.datasets.test_layouts import kitti_folder, scene_folder, sintel_folder
-from tests.evaluation.datasets.test_open import davis_folder, plain_folder
-from tests.evaluation.datasets.test_tum import tum_folder
+from tests.clips.captures import folders
 from tests.fuzz.cases import Reader
+from tests.research.evaluation.datasets.test_dycheck import dycheck_folder
+from tests.research.evaluation.datasets.test_layouts import kitti_folder, scene_folder, sintel_folder
+from tests.research.evaluation.datasets.test_open import davis_folder, plain_folder
+from tests.research.evaluation.datasets.test_tum import tum_folder
 from tests.results.test_foreign import QUATERNIONS, WRITERS
-from vggtjax.captures.depth_files import read_dpt, read_exr, read_npy, read_png
-from vggtjax.captures.table import read_capture
+from tests.shared.dataset_files import depth_png, dpt, npy, png, write
+from vggtjax.clips.captures.depth_files import read_dpt, read_exr, read_npy, read_png
+from vggtjax.clips.captures.table import read_capture
 from vggtjax.clips.clip import Clip, load_clip
 from vggtjax.clips.masks import load_masks
+from vggtjax.clips.media.images import read_image
+from vggtjax.clips.media.sampling import Sampling
 from vggtjax.clips.queries import parse_queries
 from vggtjax.clips.sources import clips_by_name, open_source
-from vggtjax.evaluation.datasets import find_sequences
-from vggtjax.known.depths import read_depths
-from vggtjax.known.intrinsics import at_clip_pixels, read_intrinsics
-from vggtjax.known.poses import checked_known_poses, read_poses
-from vggtjax.media.images import read_image
-from vggtjax.media.sampling import Sampling
-from vggtjax.reconstruction import Reconstruction
+from vggtjax.pipeline.known.depths import read_depths
+from vggtjax.pipeline.known.intrinsics import at_clip_pixels, read_intrinsics
+from vggtjax.pipeline.known.poses import checked_known_poses, read_poses
+from vggtjax.research.evaluation.datasets import find_sequences
+from vggtjax.results.reconstruction import Reconstruction
 
 SIDE = 28
 _POSES = "".join(f"{number} {number} {number % 2} 0 0 0 0 1\n" for number in range(3))

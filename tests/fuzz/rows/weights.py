@@ -12,14 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from converters.files import read_state_dict
-from tests.dataset_files import write
 from tests.fuzz.cases import Reader
 from tests.fuzz.rows.strangers import file
-from tests.tiny import tiny_config
-from vggtjax.checkpoint import flat_shapes, read_model, write_checkpoint
+from tests.shared.dataset_files import write
+from tests.shared.tiny import tiny_config
 from vggtjax.config import VGGTConfig
-from vggtjax.method.fusion_family import start
-from vggtjax.method.fusion_file import load_fusion, save_fusion
+from vggtjax.method.fusion.family import start
+from vggtjax.method.fusion.file import load_fusion, save_fusion
+from vggtjax.network.checkpoint import flat_shapes, read_model, write_checkpoint
 from vggtjax.storage.json_values import read_json
 from vggtjax.storage.tensor_file import Spec, write_tensors
 from vggtjax.training.checkpoints import restore, save

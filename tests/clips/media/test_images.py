@@ -1,0 +1,126 @@
+"""Image files of every kind as RGB, and files that cannot be read."""
+
+import struct
+import zlib
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from vggtjax.clips.media.images import read_image
+from vggtjax.errors import ClipError
+
+RAMP = np.array([[0, 128, 129, 33023, 65535]], np.uint16)
+RAMP_8 = [0, 0, 1, 128, 255]
+
+
+def pixels(path):
+    image = read_image(path)
+    assert image.mode == "RGB"
+    return np.asarray(image)
+
+
+def save(path, image, **options):
+    image.save(path, **options)
+    return path
+
+
+@pytest.mark.parametrize("name", ["grey.png", "grey.tif"])
+def test_sixteen_bit_grey_is_scaled_not_clipped(tmp_path, name):
+    image = pixels(save(tmp_path / name, Image.fromarray(RAMP)))
+    np.testing.assert_array_equal(image, np.repeat(np.array([RAMP_8])[..., None], 3, 2))
+
+
+def test_sixteen_bit_colour_is_scaled_not_clipped(tmp_path):
+    def chunk(kind, data):
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    colours = np.array([[[0, 32896, 65535], [65535, 0, 257]]], ">u2")
+    header = struct.pack(">IIBBBBB", 2, 1, 16, 2, 0, 0, 0)
+    data = zlib.compress(b"\0" + colours.tobytes())
+    path = tmp_path / "colour.png"
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b""))
+    np.testing.assert_array_equal(pixels(path), [[[0, 128, 255], [255, 0, 1]]])
+
+
+def test_floating_point_and_more_than_sixteen_bits(tmp_path):
+    deep = save(tmp_path / "deep.tif", Image.fromarray(np.array([[70000, 0]], np.int32)))
+    with pytest.raises(ClipError, match=r"frame deep.tif has values from 0 to 70000; expected 16 bits"):
+        read_image(deep)
+    signed = Image.fromarray(RAMP.astype(np.int32))
+    np.testing.assert_array_equal(pixels(save(tmp_path / "signed.tif", signed))[0, :, 0], RAMP_8)
+    image = pixels(save(tmp_path / "float.tif", Image.fromarray(np.array([[0, 0.5, 1]], np.float32))))
+    np.testing.assert_array_equal(image[..., 0], [[0, 128, 255]])
+    path = save(tmp_path / "nan.tif", Image.fromarray(np.array([[np.nan, 0.5]], np.float32)))
+    with pytest.raises(ClipError, match=r"frame nan.tif has values that are not finite"):
+        read_image(path)
+
+
+def test_transparency_is_composited_over_white(tmp_path):
+    clear, half = (10, 20, 30, 0), (0, 100, 200, 128)
+    image = Image.new("RGBA", (2, 1), clear)
+    image.putpixel((1, 0), half)
+    expected = [[[255, 255, 255], [127, 177, 227]]]
+    np.testing.assert_array_equal(pixels(save(tmp_path / "rgba.png", image)), expected)
+
+    grey = Image.new("LA", (2, 1), (10, 0))
+    grey.putpixel((1, 0), (100, 255))
+    np.testing.assert_array_equal(pixels(save(tmp_path / "la.png", grey))[0, :, 0], [255, 100])
+
+
+def test_palettes_one_bit_and_cmyk(tmp_path):
+    palette = Image.new("P", (3, 1))
+    palette.putpalette([255, 0, 0, 0, 255, 0, 0, 0, 255])
+    palette.putdata([0, 1, 2])
+    colours = [[255, 0, 0], [0, 255, 0], [0, 0, 255]]
+    np.testing.assert_array_equal(pixels(save(tmp_path / "p.png", palette))[0], colours)
+    colours[0] = [255, 255, 255]
+    np.testing.assert_array_equal(pixels(save(tmp_path / "clear.png", palette, transparency=0))[0], colours)
+    bits = Image.new("1", (2, 1))
+    bits.putpixel((1, 0), 1)
+    np.testing.assert_array_equal(pixels(save(tmp_path / "bits.png", bits))[0, :, 0], [0, 255])
+    ink = Image.new("CMYK", (8, 8), (0, 255, 255, 0))
+    assert np.abs(pixels(save(tmp_path / "ink.jpg", ink, quality=100)).astype(int) - (255, 0, 0)).max() < 8
+
+
+def test_exif_orientation(tmp_path):
+    image = Image.new("RGB", (4, 2), "black")
+    image.putpixel((0, 0), (255, 255, 255))
+    exif = Image.Exif()
+    exif[0x0112] = 6  # shown turned by 90 degrees clockwise: the upper left corner goes to the upper right
+    turned = pixels(save(tmp_path / "a.png", image, exif=exif))
+    assert turned.shape == (4, 2, 3)
+    assert turned[0, 1].tolist() == [255, 255, 255]
+    assert turned.sum() == 3 * 255
+
+
+@pytest.mark.parametrize(("ending", "kept"), [("png", 0.6), ("jpg", 0.6), ("tif", 0.6), ("webp", 0.6), ("png", 0)])
+def test_truncated_files(tmp_path, ending, kept):
+    noise = np.random.default_rng(0).integers(0, 256, (40, 40, 3), np.uint8)
+    path = save(tmp_path / f"cut.{ending}", Image.fromarray(noise))
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * kept)])
+    with pytest.raises(ClipError, match=f"cut.{ending}"):
+        read_image(path)
+
+
+def test_files_that_are_no_images(tmp_path):
+    path = tmp_path / "a.png"
+    with pytest.raises(ClipError, match="does not exist"):
+        read_image(path)
+    path.write_text("%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 10 10\n")  # a program for another interpreter
+    with pytest.raises(ClipError, match="not an image of a known format; expected one of PNG, JPEG"):
+        read_image(path)
+    with pytest.raises(ClipError, match=r"cannot read image .*directory"):
+        read_image(tmp_path)
+
+
+def test_an_absurdly_large_image(tmp_path, monkeypatch):
+    path = save(tmp_path / "cut.png", Image.new("1", (4000, 3000)))
+    path.write_bytes(path.read_bytes()[:300])
+    with pytest.raises(ClipError, match=r"bytes and says it has 4000 x 3000 pixels; get it whole"):
+        read_image(path)
+    path = save(tmp_path / "bomb.png", Image.new("1", (400, 400)))
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 400 * 400 // 3)
+    with pytest.raises(ClipError, match=r"cannot read image .*bomb.png.*exceeds limit"):
+        read_image(path)

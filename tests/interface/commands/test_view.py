@@ -1,0 +1,106 @@
+"""The command view: what it writes, and one sentence for what it cannot do."""
+
+import socket
+
+import pytest
+
+from tests.shared.room import make_room
+from vggtjax.errors import InputError
+from vggtjax.interface.commands import main as cli
+from vggtjax.results.viewer.page import viewer_page
+from vggtjax.results.viewer.server import PageServer
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("results") / "room"
+    make_room(3).save(folder)
+    return folder
+
+
+def run(capsys, *arguments) -> tuple[int, str, str]:
+    code = cli.main(["view", *map(str, arguments)])
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def test_a_page_is_written(tmp_path, capsys, folder):
+    page = tmp_path / "scene.html"
+    code, out, err = run(capsys, folder, folder, "--export", page)
+    assert code == 0, err
+    assert str(page) in out
+    assert page.read_text(encoding="utf-8").startswith("<!doctype html>")
+
+
+def test_an_existing_page_is_replaced_on_request_and_the_result_never(tmp_path, capsys, folder):
+    page = tmp_path / "mine.html"
+    page.write_text("mine")
+    code, _, err = run(capsys, folder, "--export", page)
+    assert (code, "exists and is not replaced" in err, page.read_text()) == (2, True, "mine")
+    assert run(capsys, folder, "--export", page, "--overwrite")[0] == 0
+    assert page.read_text().startswith("<!doctype html>")
+    report = folder / "report.html"
+    report.write_text("the result's")
+    code, _, err = run(capsys, folder, "--export", report, "--overwrite")
+    assert (code, "is part of the result" in err, report.read_text()) == (2, True, "the result's")
+    own = folder / "preview" / "viewer.html"
+    for _ in range(2):  # added to a result, as the demo does
+        assert run(capsys, folder, "--export", own, "--overwrite")[0] == 0
+    assert run(capsys, folder, "--export", own)[0] == 2
+
+
+def test_what_cannot_be_viewed_is_one_sentence(tmp_path, capsys, folder):
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        for arguments, sentence in (
+            ((), "no result; name the folder"),
+            ((folder, "--export", tmp_path / "scene.mp4"), "ends with .html"),
+            ((folder, "--export", tmp_path / "scene.viser"), "--to rerun writes a recording"),
+            ((folder, "--port", port), f"port {port} of 127.0.0.1 is in use"),
+            ((folder, "--host", "203.0.113.7"), "no address of this machine"),
+            ((folder, "--format", "monst3r"), "--quaternion wxyz"),
+        ):
+            code, _, err = run(capsys, *arguments)
+            assert code == 2
+            assert sentence in err
+            assert err.strip().splitlines()[-1].startswith("vggtjax: ")
+            assert "Traceback" not in err
+    assert not list(tmp_path.iterdir())
+
+
+class Ended:
+    """Stands for the server's loop: it ends at once, as by Ctrl-C."""
+
+    def __init__(self, monkeypatch, ssh):
+        self.page, self.opened = "", []
+        monkeypatch.setattr(PageServer, "serve_forever", lambda server: self.end(server))
+        monkeypatch.setattr("webbrowser.open", lambda url: self.opened.append(url))
+        monkeypatch.setenv("DISPLAY", ":0")
+        monkeypatch.delenv("SSH_CONNECTION", raising=False)
+        if ssh:
+            monkeypatch.setenv("SSH_CONNECTION", "198.51.100.2 50000 198.51.100.7 22")
+
+    def end(self, server):
+        self.page, self.port = server.page.decode(), server.server_port
+        raise KeyboardInterrupt
+
+
+def test_over_ssh_the_tunnel_is_told_and_no_browser_opened(monkeypatch, capsys, folder):
+    ended = Ended(monkeypatch, ssh=True)
+    code, out, _ = run(capsys, folder, "--port", 0)
+    assert code == 0
+    assert f"The viewer: http://127.0.0.1:{ended.port}/" in out
+    assert f"ssh -L {ended.port}:127.0.0.1:{ended.port} 198.51.100.7\n" in out
+    assert ended.opened == []
+    assert ended.page.startswith("<!doctype html>")
+    assert "The viewer has ended." in out
+
+
+def test_a_notebook_shows_a_result():
+    viewer = make_room(2).view(names=["<b>mine</b>"], height=300)
+    cell = viewer._repr_html_()
+    assert cell.startswith('<iframe srcdoc="&lt;!doctype html')
+    assert "height: 300px" in cell
+    assert "<b>" not in viewer.html
+    with pytest.raises(InputError, match="2 names for 1 results"):
+        viewer_page([make_room(2)], names=["one", "two"])

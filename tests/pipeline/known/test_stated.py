@@ -1,0 +1,165 @@
+"""The focal length that cameras write into their files: EXIF of pictures, QuickTime's metadata of videos."""
+
+import dataclasses
+import re
+from contextlib import suppress
+
+import av
+import numpy as np
+import pillow_heif
+import pytest
+from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
+
+from tests.shared.room import make_room
+from vggtjax import load_clip
+from vggtjax.clips.media.focal import picture_focal
+from vggtjax.errors import InputError
+from vggtjax.interface.commands import main as cli
+from vggtjax.pipeline.known.given import read_known
+from vggtjax.pipeline.known.options import KnownGeometry
+from vggtjax.pipeline.known.stated import disagreement, focal_stated, stated_intrinsics
+
+FILM, FOCAL, PLANE, UNIT, ZOOM, WIDTH, HEIGHT = 0xA405, 0x920A, 0xA20E, 0xA210, 0xA404, 0xA002, 0xA003
+EXIF = KnownGeometry(intrinsics="exif")
+SENSOR = {FOCAL: IFDRational(50, 10), PLANE: IFDRational(4000, 6), UNIT: 4, WIDTH: 4000, HEIGHT: 3000}  # 6 x 4.5 mm
+
+
+def write(path, tags, size=(400, 300), orientation=1):
+    """A picture as a camera writes it; `size` is that of the stored pixels."""
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    exif.get_ifd(0x8769).update(tags)
+    if path.suffix == ".heic":
+        pillow_heif.register_heif_opener()
+    Image.new("RGB", size, "green").save(path, exif=exif)
+    return path
+
+
+def write_video(path, focal):
+    with av.open(str(path), "w", options={"movflags": "use_metadata_tags"}) as container:
+        container.metadata["com.apple.quicktime.camera.focal_length.35mm_equivalent"] = focal
+        stream = container.add_stream("mpeg4", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        for frame in [av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8))] * 2 + [None]:
+            container.mux(stream.encode(frame))
+
+
+@pytest.mark.parametrize(
+    ("tags", "pixels"),
+    [
+        ({FILM: 26}, 26 * 500 / np.hypot(36, 24)),
+        ({FILM: 52, ZOOM: 2.0, WIDTH: 4000, HEIGHT: 3000}, 52 * 500 / np.hypot(36, 24)),  # zoom is in it; made smaller
+        (SENSOR, 5 * 400 / 6),
+        (SENSOR | {FILM: 0}, 5 * 400 / 6),  # 0: unknown
+        (SENSOR | {ZOOM: 1.5}, 1.5 * 5 * 400 / 6),
+        (SENSOR | {ZOOM: IFDRational(0, 0)}, 5 * 400 / 6),
+        ({FOCAL: 5.0, PLANE: 1e4 / 2.54, UNIT: 2}, 5 * 1e4 / 2.54 / 25.4),  # an inch; no size when it was taken
+        ({FOCAL: 5.0, PLANE: 1e4 / 2.54}, 5 * 1e4 / 2.54 / 25.4),
+    ],
+)
+def test_pixels_of_what_a_picture_states(tmp_path, tags, pixels):
+    assert picture_focal(write(tmp_path / "a.jpg", tags)).pixels == pytest.approx(pixels, rel=1e-5)
+
+
+@pytest.mark.parametrize("ending", [".jpg", ".heic"])
+def test_a_turned_picture_keeps_its_focal_length_at_the_pixels_of_the_model(tmp_path, ending):
+    write(tmp_path / f"a{ending}", {FILM: 28, WIDTH: 4000, HEIGHT: 3000}, orientation=6)  # shown 300 wide, 400 high
+    clip = load_clip(tmp_path / f"a{ending}", size=56)
+    if ending == ".jpg":  # a HEIC file has no orientation in EXIF, and Pillow's writer none of its own
+        assert clip.source_size.tolist() == [[400, 300]]
+    K = np.asarray(read_known(EXIF, clip).intrinsics)[0]
+    focal = 28 * 500 / np.hypot(36, 24)
+    np.testing.assert_allclose(K[[0, 1], [0, 1]], focal / clip.source_scale[0], rtol=1e-6)
+    np.testing.assert_allclose(K[:2, 2], np.array(clip.images.shape[2:0:-1]) / 2)  # the middle of the cut frame
+
+
+def test_pictures_of_a_folder_have_their_own_focal_lengths(tmp_path):
+    for number, film in enumerate((26, 26, 52, 77)):
+        write(tmp_path / f"{number}.jpg", {FILM: film})
+    clip = load_clip(tmp_path, size=56, start=1)
+    np.testing.assert_allclose(stated_intrinsics(clip)[:, 0, 0], np.array([26, 52, 77]) * 500 / np.hypot(36, 24))
+    assert getattr(focal_stated(clip), "words", None) == "52 mm as on 35 mm film"
+    write(tmp_path / "2.jpg", {})
+    with pytest.raises(InputError, match=r"2\.jpg states no focal length in its EXIF data; give fx,fy,cx,cy"):
+        read_known(EXIF, clip)
+    assert focal_stated(clip) is None
+
+
+def test_a_phone_s_video_states_it_in_its_metadata(tmp_path):
+    write_video(tmp_path / "a.mov", "26")
+    clip = load_clip(tmp_path / "a.mov", size=56)
+    assert stated_intrinsics(clip)[0, 0, 0] == pytest.approx(26 * 80 / np.hypot(36, 24))
+    assert stated_intrinsics(clip)[0, :2, 2].tolist() == [32, 24]
+    for lie in ("0", "nan", "wide", "1e9", "-26"):
+        write_video(tmp_path / "a.mov", lie)
+        clip = load_clip(tmp_path / "a.mov", size=56)
+        with pytest.raises(InputError, match=r"states a focal length of .*; expected"):
+            read_known(EXIF, clip)
+        assert focal_stated(clip) is None
+
+
+LIES = [
+    ({FILM: 65535}, "states a focal length of 65535 mm as on 35 mm film, .* expected 40 to 20000"),
+    ({FILM: 0, FOCAL: IFDRational(0, 0)}, "states no focal length"),
+    ({FILM: 0, FOCAL: IFDRational(1, 0)}, "states no focal length"),
+    ({FOCAL: 5.0}, "states a focal length of 5 mm and no size of the sensor"),
+    (SENSOR | {UNIT: 77}, "and no size of the sensor"),
+    (SENSOR | {FOCAL: 1e9}, "expected 40 to 20000"),
+    ({FILM: 26, WIDTH: 4000, HEIGHT: 4000}, "is 400 x 300 and was 4000 x 4000 when it was taken.* so it was cut"),
+]
+
+
+@pytest.mark.parametrize(("tags", "words"), LIES)
+def test_what_no_camera_has_is_refused_when_asked_for_and_ignored_else(tmp_path, tags, words, caplog):
+    clip = load_clip(write(tmp_path / "a.jpg", tags), size=56)
+    assert focal_stated(clip) is None
+    assert not caplog.records
+    with pytest.raises(InputError, match=words) as problem:
+        read_known(EXIF, clip)
+    assert "\n" not in str(problem.value)
+
+
+def test_broken_exif_data_state_nothing_and_warn_of_nothing(tmp_path):
+    """Pillow warns of tags that end early, and warnings are errors here."""
+    whole = write(tmp_path / "a.jpg", SENSOR).read_bytes()
+    start = whole.index(b"Exif")
+    for place in range(start + 4, start + 60):
+        (tmp_path / "a.jpg").write_bytes(whole[:place] + b"\xff" + whole[place + 1 :])
+        with suppress(InputError):
+            assert 40 <= picture_focal(tmp_path / "a.jpg").pixels <= 20_000
+
+
+def test_arrays_and_results_have_no_files():
+    with pytest.raises(InputError, match="the clip is not from files"):
+        read_known(EXIF, load_clip(np.zeros((2, 56, 56, 3), np.uint8), size=56))
+    with pytest.raises(InputError, match="a result has no files"):
+        read_known(EXIF, make_room())
+
+
+def test_the_command_info_says_what_a_clip_is(tmp_path, capsys):
+    for number in range(2):
+        write(tmp_path / f"{number}.jpg", {FILM: 26})
+    assert cli.main(["info", str(tmp_path)]) == 0
+    shown = capsys.readouterr().out
+    assert "400 x 300 pixels of the first frame, upright" in shown
+    assert "26 mm as on 35 mm film, 300.5 pixels; --intrinsics exif takes it" in shown
+    assert re.search(r"frames +2\n", shown)
+    write(tmp_path / "0.jpg", {FILM: 60000})
+    assert cli.main(["info", str(tmp_path)]) == 0
+    assert "0.jpg" in capsys.readouterr().out
+
+
+def test_a_prediction_that_is_far_off_is_said(tmp_path):
+    room = make_room()  # 75.6 pixels of the source
+    stated = picture_focal(write(tmp_path / "a.jpg", {FILM: 26}))
+    said = disagreement(stated._replace(pixels=75.6 / 0.79), room)
+    assert said == (
+        "the predicted focal length, 75.6 pixels across, is -21% off what the camera states; --intrinsics exif takes "
+        "the camera's"
+    )
+    taller = room.intrinsics.copy()
+    taller[:, 1, 1] *= 1.3
+    unequal = dataclasses.replace(room, intrinsics=taller)
+    assert "98.28 pixels down, is +30%" in str(disagreement(stated._replace(pixels=75.6), unequal))
+    assert disagreement(stated._replace(pixels=75.6 / 0.81), room) is None

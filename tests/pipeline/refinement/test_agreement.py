@@ -1,0 +1,56 @@
+"""Consistent depth through whole reconstructions: the option, several methods, and long clips."""
+
+import numpy as np
+import pytest
+
+from tests.pipeline.windows.walk import CONFIG, FRAMES, SETTINGS, plan_of, tools_of, walk, window_result, windows_of
+from tests.shared.corner import make_corner, paint
+from tests.shared.tiny import tiny_model
+from vggtjax import Reconstruction, load_clip, reconstruct
+from vggtjax.options import Options
+from vggtjax.pipeline import agreement
+from vggtjax.pipeline.known.options import KnownGeometry
+from vggtjax.pipeline.refinement.consistent import ConsistencyReport
+from vggtjax.pipeline.several import reconstruct_methods
+from vggtjax.pipeline.windows import run as windows
+from vggtjax.progress import StageSeconds
+
+
+@pytest.mark.filterwarnings("ignore:the field of view")
+def test_the_option_and_its_outcome_reach_the_result(tmp_path):
+    model, clip = tiny_model(), load_clip(paint(make_corner(3, 0.5)), size=56)
+    times = StageSeconds()
+    known = KnownGeometry(intrinsics="170,170,96,72", baseline="0,2,1.5")
+    result = reconstruct(model, clip, method="vggt", consistent_depth=True, known=known, on_stage=times.stage)
+    assert "consistent depth" in times.seconds
+    assert result.settings["consistent_depth"] is True
+    outcome = result.settings["consistency"]
+    assert result.known_facts["depth"] == outcome["sentence"]
+    np.testing.assert_allclose(result.intrinsics[:, [0, 1], [0, 1]], 170 * 56 / 192, rtol=1e-6)  # the known ones
+    assert np.linalg.norm(np.subtract(*result.camera_centres[[0, 2]])) == pytest.approx(1.5, rel=1e-4)
+    result.save(tmp_path / "out", only=("report",))
+    assert outcome["sentence"][:40] in (tmp_path / "out" / "report.html").read_text()
+    assert "consistent_depth" not in Options().to_json()
+    together = reconstruct_methods(model, clip, ("vggt",), consistent_depth=True)["vggt"]
+    alone = reconstruct(model, clip, method="vggt", consistent_depth=True)
+    assert together.settings == alone.settings
+    np.testing.assert_array_equal(together.depth, alone.depth)
+
+
+def test_a_long_clip_is_made_consistent_after_its_windows_are_joined(tmp_path, monkeypatch):
+    images, seen = np.asarray(walk().images), []
+
+    def recorded(result, pictures, **_):
+        seen.append((len(result.depth), len(list(pictures))))
+        return result, ConsistencyReport(False)
+
+    def run(clip):
+        return window_result(clip, 0, np.zeros((FRAMES, CONFIG.height, CONFIG.width), bool))
+
+    monkeypatch.setattr(agreement, "consistent_depth", recorded)
+    for consistent in (False, True):
+        plan, out = plan_of(masks=True), tmp_path / str(consistent)
+        windows.run_windows(images, out, windows_of(loops=False), plan, tools_of(run), SETTINGS, consistent=consistent)
+    assert seen == [(FRAMES, FRAMES)]
+    made = [Reconstruction.load(tmp_path / str(consistent)) for consistent in (False, True)]
+    assert ["consistent_depth" in each.settings for each in made] == [False, True]

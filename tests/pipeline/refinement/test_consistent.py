@@ -1,0 +1,166 @@
+"""Consistent depth: a painted room seen from known places, moving posters, and what is left as it was."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.ndimage import zoom
+
+from tests.shared.corner import HEIGHT, SCALE, WIDTH, corner_result, make_corner, paint
+from vggtjax.errors import ClipError
+from vggtjax.pipeline.refinement import consistent
+from vggtjax.pipeline.refinement.consistent import consistent_depth
+from vggtjax.pipeline.refinement.dense import KNOWN
+from vggtjax.research.evaluation.metrics.depth import depth_errors
+from vggtjax.research.evaluation.metrics.trajectory import rotation_error
+
+
+@pytest.fixture(scope="module")
+def corner():
+    return make_corner(4, 0.7)
+
+
+@pytest.fixture(scope="module")
+def pictures(corner):
+    return paint(corner)
+
+
+@pytest.fixture(scope="module")
+def truth(corner):
+    return corner_result(corner, degrees=0, share=0)
+
+
+@pytest.fixture(scope="module")
+def predicted(corner):
+    """A result whose depth is wrong by a smooth field of its own in each frame, and whose cameras are turned."""
+    return wavy(corner_result(corner, degrees=2, share=0))
+
+
+def wavy(result):
+    noise = np.random.default_rng(3).normal(0, 0.15, (len(result.depth), 3, 4))
+    size = result.depth.shape[1:]
+    fields = np.array([zoom(each, (size[0] / 3, size[1] / 4), order=1) for each in noise])
+    return dataclasses.replace(result, depth=result.depth * np.exp(fields).astype(np.float32))
+
+
+def errors(result, truth, corner):
+    known = truth.depth > 0
+    return depth_errors(result.depth, truth.depth, known).abs_rel, rotation_error(
+        result.camera_from_world, corner.camera_from_world
+    )
+
+
+def test_depth_and_cameras_come_to_the_truth(corner, pictures, truth, predicted):
+    steps = []
+    made, report = consistent_depth(predicted, iter(pictures), progress=lambda done, total: steps.append((done, total)))
+    before, after = (np.array(errors(each, truth, corner)) for each in (predicted, made))
+    assert report.changed
+    assert (after < [0.4 * before[0], 0.1 * before[1]]).all()
+    assert report.layers_after < 0.3 * report.layers_before
+    assert report.joined > 0.5
+    assert made.settings["consistency"]["sentence"] == report.sentence == made.known_facts["depth"]
+    assert [done for done, _ in steps] == sorted(done for done, _ in steps)
+    assert steps[-1][0] == steps[-1][1]
+    np.testing.assert_allclose(made.camera_from_world[0], predicted.camera_from_world[0], atol=1e-6)
+    np.testing.assert_array_equal(made.dynamic_mask, predicted.dynamic_mask)
+
+
+def test_its_own_small_pictures_are_enough_to_get_better(corner, pictures, truth, predicted):
+    own = dataclasses.replace(predicted, images=pictures[:, 1::SCALE, 1::SCALE])
+    made, report = consistent_depth(own, join=False)
+    assert report.changed
+    assert report.joined == 0
+    before, after = (np.array(errors(each, truth, corner)) for each in (predicted, made))
+    assert (after < 0.8 * before).all()
+
+
+def test_cameras_change_alone_where_frames_agree_less_after_the_fields(corner, pictures, truth, predicted, monkeypatch):
+    monkeypatch.setattr(consistent, "_MOST_WORSE", 0.0)
+    only_turned = dataclasses.replace(predicted, depth=truth.depth)
+    made, report = consistent_depth(only_turned, iter(pictures), join=False)
+    assert report.changed
+    assert report.change == 0
+    assert "not changed; only the cameras fit pixels in" in report.sentence
+    np.testing.assert_array_equal(made.depth, only_turned.depth)
+    assert errors(made, truth, corner)[1] < 0.2 * errors(only_turned, truth, corner)[1]
+
+
+def test_known_cameras_stay(corner, pictures, truth, predicted):
+    known = dataclasses.replace(predicted, camera_from_world=truth.camera_from_world, intrinsics=truth.intrinsics)
+    made, _ = consistent_depth(known, iter(pictures), priors=KNOWN)
+    assert rotation_error(made.camera_from_world, truth.camera_from_world) < 0.02
+    np.testing.assert_array_equal(made.intrinsics, known.intrinsics)
+    assert errors(made, truth, corner)[0] < 0.3 * errors(known, truth, corner)[0]
+
+
+def test_what_moves_has_no_vote(corner, pictures, truth, predicted):
+    moved, mask = pictures.copy(), np.zeros_like(predicted.dynamic_mask)
+    poster = np.random.default_rng(5).integers(0, 255, (12, 16, 1), np.uint8).repeat(6, 0).repeat(6, 1).repeat(3, 2)
+    for frame in range(len(moved)):
+        left = 4 + 17 * frame
+        moved[frame, 50:122, left : left + 96] = poster
+        mask[frame, 50 // SCALE : 41, left // SCALE : left // SCALE + 33] = True
+    masked = dataclasses.replace(predicted, dynamic_mask=mask)
+    made, _ = consistent_depth(masked, iter(moved))
+    static = ~mask & (truth.depth > 0)
+    before, after = (depth_errors(each.depth, truth.depth, static).abs_rel for each in (masked, made))
+    assert after < 0.5 * before
+    assert errors(made, truth, corner)[1] < 0.2 * errors(masked, truth, corner)[1]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda r, p: (r, np.full_like(p, 128)), "matched pixels tell the depth of 0.0% of the picture"),
+        (lambda r, p: (r, np.repeat(p[:1], len(p), axis=0)), "matched pixels tell the depth of"),
+        (
+            lambda r, p: (dataclasses.replace(r, dynamic_mask=np.ones_like(r.dynamic_mask)), p),
+            "0.0% of the picture shows",
+        ),
+        (lambda r, p: (first_frames(r, 2), p[:2]), "the clip has 2 frames; 3 to 512 are adjusted together"),
+        (lambda r, p: (first_frames(r, 1), p[:1]), "the clip has 1 frame;"),
+    ],
+    ids=["no texture", "a camera that stands", "all moves", "two frames", "one frame"],
+)
+def test_depth_stays_where_pixels_say_too_little(predicted, pictures, caplog, change, words):
+    result, shown = change(predicted, pictures)
+    made, report = consistent_depth(result, iter(shown))
+    assert not report.changed
+    assert words in report.sentence
+    assert (report.sentence in caplog.text) == (len(shown) > 2)  # a photograph needs no warning
+    np.testing.assert_array_equal(made.depth, result.depth)
+    np.testing.assert_array_equal(made.camera_from_world, result.camera_from_world)
+    np.testing.assert_array_equal(made.intrinsics, result.intrinsics)
+
+
+def test_a_lens_that_zooms_is_noticed_unless_it_is_known(corner, monkeypatch):
+    """The corner's three planes and short path hide a zoom better than most clips do: hence the lower threshold."""
+    monkeypatch.setattr(consistent, "_MOST_ZOOM", 2e-5)
+    zoomed = corner.intrinsics.copy()
+    zoomed[:, [0, 1], [0, 1]] *= np.geomspace(1, 1.2, len(zoomed))[:, None]
+    zooms = corner._replace(intrinsics=zoomed)
+    pictures, result = paint(zooms), wavy(corner_result(zooms, degrees=0, share=0))
+    one = dataclasses.replace(result, intrinsics=np.repeat(result.intrinsics[:1], len(zoomed), axis=0))
+    fields = [consistent_depth(one, iter(pictures)), consistent_depth(result, iter(pictures), priors=KNOWN)]
+    assert [report.change > 0 for _, report in fields] == [False, True]
+    monkeypatch.setattr(consistent, "_MOST_ZOOM", 1.0)
+    assert consistent_depth(one, iter(pictures))[1].change > 0  # so it was the guard
+
+
+def test_pictures_of_another_clip_are_refused(predicted, pictures):
+    with pytest.raises(ClipError, match=f"100 x {HEIGHT} pixels; the result was made from {WIDTH} x {HEIGHT}"):
+        consistent_depth(predicted, iter(pictures[:, :, :100]))
+    with pytest.raises(ClipError, match="gives 3 pictures of the 4 frames"):
+        consistent_depth(predicted, iter(pictures[:3]))
+
+
+def first_frames(result, count):
+    arrays = {
+        name: getattr(result, name)
+        for name in ("depth", "depth_confidence", "saliency", "motion", "dynamic_mask", "images")
+    }
+    arrays |= {name: getattr(result, name) for name in ("camera_from_world", "intrinsics", "frame_names", "timestamps")}
+    arrays |= {name: getattr(result, name) for name in ("source_size", "source_scale", "source_offset", "valid_box")}
+    return dataclasses.replace(
+        result, **{name: value if value is None else value[:count] for name, value in arrays.items()}
+    )

@@ -1,0 +1,1 @@
+"""What several tests, and benchmarks, use: seeded weights, golden numbers, small worlds."""

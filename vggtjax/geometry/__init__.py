@@ -1,1 +1,0 @@
-"""Geometry of space that is not of one camera."""

@@ -1,0 +1,70 @@
+"""The command `vggtjax scenes`. Does not import jax before it is needed."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from vggtjax.interface.commands.report import Report
+
+
+@dataclass(frozen=True)
+class Images:
+    """How the images are drawn.
+
+    Attributes:
+        frames: of each scene.
+        height: of the images, in pixels.
+        width: of the images, in pixels.
+        samples: rays per pixel along each side, averaged in the image.
+        shutter: share of the time between frames in which the shutter is open, for motion blur; needs exposures.
+        exposures: instants that motion blur averages over.
+    """
+
+    frames: int = 24
+    height: int = 240
+    width: int = 320
+    samples: int = 2
+    shutter: float = 0.0
+    exposures: int = 1
+
+
+def scenes(
+    out: Path,
+    *,
+    count: int = 8,
+    images: Annotated[Images, tyro.conf.OmitArgPrefixes] = Images(),
+    kind: Literal["static", "dynamic"] = "dynamic",
+    split: Literal["training", "test"] = "training",
+    seed: int = 0,
+) -> None:
+    """Generate clips of rooms with exact depth, masks, parts, flow and cameras; `vggtjax evaluate plain` reads them.
+
+    Args:
+        out: folder of the set; existing scenes are kept, so the same command resumes an interrupted set.
+        count: number of scenes.
+        images: how the images are drawn.
+        kind: "static", or "dynamic" where one to three objects move, not always in view.
+        split: of the textures; the two splits share no pixels of a photograph.
+        seed: another seed draws other scenes.
+    """
+    report = Report()
+    with report.running():
+        with report.stage("prepare"):
+            from vggtjax.training.scenes.config import SceneConfig
+            from vggtjax.training.scenes.dataset import write_scenes
+
+            config = SceneConfig(**asdict(images))
+        with report.stage("generate") as progress:
+            folders = write_scenes(out, config, count=count, kind=kind, split=split, seed=seed, progress=progress)
+    report.table(
+        {
+            "scenes": f"{len(folders)} of {images.frames} frames of {images.width} x {images.height} pixels, {kind}",
+            "first": f"{folders[0]}/",
+            "index": out / "index.json",
+            "preview": out / "preview.png",
+        }
+    )

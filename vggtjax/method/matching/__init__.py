@@ -1,0 +1,1 @@
+"""Motion from matches between frames, which is not in the papers."""

@@ -1,0 +1,1 @@
+"""Tokens -> cameras, dense maps, tracks."""

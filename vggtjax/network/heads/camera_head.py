@@ -1,0 +1,86 @@
+"""Camera head: camera tokens -> pose encoding, by iterative refinement (VGGT)."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+from jaxtyping import Array, Float, Int
+
+from vggtjax.config import VGGTConfig
+from vggtjax.network.block import Block, apply_block
+from vggtjax.network.heads.pose import POSE_SIZE
+from vggtjax.network.kernels.frames import Frames
+from vggtjax.network.layers import MLP, Dense, LayerNorm, Params, apply, iterate, stack
+from vggtjax.network.precision import full_precision
+
+ITERATIONS = 4
+
+
+@full_precision
+def predict_pose(
+    params: Params,
+    camera_tokens: Float[Array, "B S E"],
+    config: VGGTConfig,
+    *,
+    frame_count: Int[Array, " B"] | None = None,
+    stop_gradient: bool = True,
+    compute_dtype: str | None = None,
+    frames: Frames = Frames(),
+) -> Float[Array, "B S 9"]:
+    """Return the pose encoding [t(3), quaternion xyzw(4), fov_h, fov_w] of every frame.
+
+    Args:
+        params: the model's parameter tree (`camera_head` is read).
+        camera_tokens: token 0 of every frame after the last pair, E = 2C.
+        config: the model's configuration.
+        frame_count: number of real frames of each clip, its first ones; None for all.
+        stop_gradient: treat the previous estimate as a constant in each iteration, as in VGGT's training.
+        compute_dtype: type of the products of the trunk's blocks; by default that of the tokens, as all else.
+        frames: where the frames are; every device computes the poses of all frames, which takes little.
+    """
+    head = CameraHead(config, stop_gradient, compute_dtype)
+    return apply(head, params["camera_head"], camera_tokens, frame_count, frames)
+
+
+class CameraHead(nn.Module):
+    """Iterations of a transformer over frames, modulated by the previous estimate; arguments as `predict_pose`."""
+
+    config: VGGTConfig
+    stop_gradient: bool = True
+    compute_dtype: str | None = None
+
+    @nn.compact
+    def __call__(
+        self,
+        camera_tokens: Float[Array, "B S E"],
+        frame_count: Int[Array, " B"] | None = None,
+        frames: Frames = Frames(),
+    ) -> Float[Array, "B S 9"]:
+        """Return the pose encoding of every frame."""
+        config = self.config
+        S = camera_tokens.shape[1]
+        is_real = frames.are_real(frame_count, *camera_tokens.shape[:2])
+        is_real = None if is_real is None else frames.gather(is_real)
+        camera_tokens = frames.gather(camera_tokens)
+        E = config.tap_dim
+        block = Block(config.camera_num_heads, dtype=jnp.dtype(self.compute_dtype or camera_tokens.dtype))
+        tokens = LayerNorm(name="token_norm")(camera_tokens)
+        normed = LayerNorm(1e-6, use_bias=False, use_scale=False)(tokens)
+        empty = self.param("empty_pose", nn.initializers.zeros, (1, 1, POSE_SIZE))
+        empty = jnp.broadcast_to(empty, (*tokens.shape[:2], POSE_SIZE)).astype(tokens.dtype)
+        embed, modulate = Dense(E, name="pose_embedding"), Dense(3 * E, name="modulation")
+        trunk, norm = stack(self, "trunk", block, config.camera_depth, tokens), LayerNorm(name="trunk_norm")
+        update = MLP(E // 2, POSE_SIZE, name="pose_branch")
+
+        def iteration(estimates):
+            pose, previous = estimates  # sum of all updates so far; input of this iteration
+            shift, scale, gate = jnp.split(modulate(nn.silu(embed(previous))), 3, axis=-1)
+            x = tokens + gate * (normed * (1 + scale) + shift)
+            x, _ = jax.lax.scan(lambda x, layer: (apply_block(block, layer, x, is_real=is_real)[0], None), x, trunk)
+            pose = pose + update(norm(x))
+            return (pose, jax.lax.stop_gradient(pose) if self.stop_gradient else pose)
+
+        pose, _ = iterate(self, iteration, (jnp.zeros_like(empty), empty), ITERATIONS)
+        pose = frames.share(pose, S)
+        return jnp.concatenate([pose[..., :7], nn.relu(pose[..., 7:])], axis=-1)

@@ -1,0 +1,178 @@
+"""Cameras and depths of cells by the clip's own pixels: matched where they are expected, and adjusted, in rounds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float, Float32, Float64, UInt8
+
+from vggtjax.cameras import Cameras
+from vggtjax.method.matching.adjustment import Adjustment, Static, adjust
+from vggtjax.method.matching.matches import frame_pairs
+from vggtjax.pipeline.refinement.cells import Cells, at_scale
+from vggtjax.pipeline.refinement.pixel_matches import Window, expected_matches, match_pixels
+
+_ANNEALED = (4.0, 3.0, 2.0, 1.5, 1.0, 1.0, 1.0, 1.0)
+_DEPTH_PRIOR = 0.6  # standard deviation of a log depth from the network's, in the rounds
+_DAMPING = 1e-5
+_SURE = 0.1  # deviation of a measured log depth, up to which it tells the network's error
+_FEWEST_SURE = 20
+_DEPTHS = (1e-6, 1e6)  # range of a measured depth
+_ERRORS = (0.03, 0.3)  # range of the network's error
+
+
+class Round(NamedTuple):
+    """Matching, then adjustment."""
+
+    pixels: int  # of a cell in the pictures
+    window: Window
+    sigma: float  # of the adjustment's loss, in cells
+
+
+ROUNDS = (
+    Round(2, Window(4, 10), 2.0),  # predicted cameras can be off by many cells
+    Round(2, Window(4, 6), 1.0),
+    Round(4, Window(4, 4), 0.4),
+    Round(8, Window(4, 4), 0.16),
+    Round(12, Window(6, 3), 0.06),
+)
+
+
+@dataclass(frozen=True)
+class CameraPriors:
+    """Standard deviations of cameras from where they start; translations are in median depths."""
+
+    rotation: float = float(np.radians(6))
+    translation: float = 0.2
+    focal: float | None = 0.15  # of the log of one factor; None: intrinsics stay
+
+
+PREDICTED = CameraPriors()
+KNOWN = CameraPriors(float(np.radians(0.01)), 0.0005, None)
+
+
+class DenseWorld(NamedTuple):
+    """A static world that the pixels agree with, at P cells."""
+
+    camera_from_world: Float64[np.ndarray, "S 3 4"]
+    focal: float  # factor of all focal lengths
+    depth: Float32[np.ndarray, "S P"]  # what matches alone say of each, cameras given
+    information: Float32[np.ndarray, "S P"]  # inverse variance of its log
+    error: float  # standard deviation of the network's log depth, as far as measured
+    parallax: float  # cells by which the middle cell moves in the frame that sees it move most, for a log depth of 1
+    zoom: float  # by which matches are further from the middle than one focal length puts them, for each frame of time
+
+
+@partial(jax.jit, static_argnames=("grid", "priors"))
+def _adjust(
+    depth: Float[Array, "S P"],
+    cameras: Cameras,
+    matched: Float[Array, "S M P 2"],
+    weight: Float[Array, "S M P"],
+    predicted: Float[Array, "S P"],
+    sigma: Float[Array, ""],
+    grid: tuple[int, int],
+    priors: CameraPriors,
+) -> Static:
+    """Return the adjusted world; `sigma` is traced, so that one program serves all rounds."""
+    how = Adjustment(
+        sigma=sigma,  # type: ignore[arg-type]
+        annealed=_ANNEALED,
+        depth_prior=_DEPTH_PRIOR,
+        rotation_prior=priors.rotation,
+        translation_prior=priors.translation,
+        focal_prior=priors.focal,
+        damping=_DAMPING,
+    )
+    return adjust(depth, cameras, matched, weight, grid, how, predicted)
+
+
+def adjust_to_pixels(
+    cells: Cells,
+    grey: UInt8[np.ndarray, "S H W"],
+    priors: CameraPriors,
+    rounds: tuple[Round, ...] = ROUNDS,
+    on_round: Callable[[], object] = lambda: None,
+) -> DenseWorld:
+    """Return cameras and depths for which cells are seen where the pixels match.
+
+    Args:
+        cells: of the result.
+        grey: pictures of what its frames show.
+        priors: how far the cameras may go from where they are.
+        rounds: from coarse to fine.
+        on_round: called after each.
+    """
+    poses, K = cells.cameras.camera_from_world.astype(np.float32), cells.cameras.intrinsics.astype(np.float32)
+    depth, factor, world = cells.depth, 1.0, None
+    for each in rounds:
+        cameras = Cameras(poses, _zoomed(K, factor))
+        expected, warp = expected_matches(depth, cameras, cells.grid)
+        pictures = at_scale(grey, cells.grid, each.pixels)
+        found = match_pixels(pictures, expected, warp, cells.grid, each.window)
+        weight = found.weight * cells.is_static[:, None]
+        if not weight.any():
+            nothing = np.zeros_like(cells.depth)
+            return DenseWorld(poses.astype(np.float64), 1.0, cells.depth, nothing, _ERRORS[0], 0.0, 0.0)
+        arrays = (depth, cameras, found.position, weight, cells.depth, np.float32(each.sigma))
+        made = jax.tree.map(np.asarray, _adjust(*arrays, cells.grid, priors))
+        poses, depth, factor = made.camera_from_world, made.depth, factor * float(made.focal)
+        with np.errstate(over="ignore"):
+            measured = np.clip(depth * np.exp(made.pull), *_DEPTHS)
+        error = _error(cells.depth, measured, made.information)
+        parallax = _parallax(depth, Cameras(poses, _zoomed(K, factor)), cells.grid)
+        zoom = _zoom(found.position, weight, made.position, each.sigma, cells.grid)
+        world = DenseWorld(poses.astype(np.float64), factor, measured, made.information, error, parallax, zoom)
+        on_round()
+    assert world is not None
+    return world
+
+
+def _parallax(depth: Float32[np.ndarray, "S P"], cameras: Cameras, grid: tuple[int, int]) -> float:
+    """Return how many cells the middle cell moves for a log depth of 1, in the frame that sees it move most."""
+    step = np.float32(0.05)
+    (nearer, _), (further, _) = (expected_matches(depth * np.exp(by), cameras, grid) for by in (-step, step))
+    moved = np.linalg.norm(further - nearer, axis=-1) / (2 * step)
+    return float(np.median(np.max(moved * frame_pairs(len(depth)).exist[:, :, None], axis=1)))
+
+
+def _zoom(
+    matched: Float32[np.ndarray, "S M P 2"],
+    weight: Float32[np.ndarray, "S M P"],
+    position: Float32[np.ndarray, "S M P 2"],
+    sigma: float,
+    grid: tuple[int, int],
+) -> float:
+    """Return how much further from the middle of the picture cells match than the world shows them, for each frame.
+
+    A share of their distance from the middle. A lens that zooms leaves it: cameras and depths explain only a part.
+    """
+    pairs = frame_pairs(len(matched))
+    error, place = matched - position, position - np.array(grid[::-1], np.float32) / 2
+    weight = weight * pairs.exist[:, :, None] / (1 + np.sum(error**2, axis=-1) / sigma**2) ** 2
+    steps = np.array(pairs.offsets, np.float32)[None, :, None]
+    grown, size = (np.sum(weight * factor * np.sum(values * place, axis=-1), dtype=np.float64)
+                   for values, factor in ((error, steps), (place, steps**2)))  # fmt: skip
+    return float(grown / size) if size > 0 else 0.0
+
+
+def _error(
+    predicted: Float32[np.ndarray, "S P"], measured: Float32[np.ndarray, "S P"], information: Float32[np.ndarray, "S P"]
+) -> float:
+    """Return the standard deviation of the log of predicted depths, by the spread of those that are measured well."""
+    ratio = np.log(measured / predicted)[information > _SURE**-2]
+    if len(ratio) < _FEWEST_SURE:
+        return _ERRORS[0]
+    return float(np.clip(np.median(np.abs(ratio - np.median(ratio))) / 0.6745, *_ERRORS))
+
+
+def _zoomed(intrinsics: Float32[np.ndarray, "S 3 3"], factor: float) -> Float32[np.ndarray, "S 3 3"]:
+    """Return intrinsics with focal lengths times a factor."""
+    K = intrinsics.copy()
+    K[:, [0, 1], [0, 1]] *= np.float32(factor)
+    return K

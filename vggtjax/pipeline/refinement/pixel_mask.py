@@ -1,0 +1,109 @@
+"""What moves, by the clip's own pixels: they match elsewhere than where a static world is seen (not in the papers)."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Float32, UInt8
+from PIL import Image
+
+from vggtjax.method.matching.matched_mask import is_moving, motion_pixels
+from vggtjax.method.matching.matched_motion import VOTE, voted
+from vggtjax.method.matching.matches import frame_pairs
+from vggtjax.network.surroundings import own_settings
+from vggtjax.pipeline.refinement.cells import Cells, at_scale, cells_of, grey_pictures
+from vggtjax.pipeline.refinement.consistent import FEWEST_FRAMES, MOST_FRAMES
+from vggtjax.pipeline.refinement.pixel_matches import PixelMatches, Window, expected_matches, match_pixels
+from vggtjax.results.result import Result
+
+R = TypeVar("R", bound=Result)
+
+_mask = jax.jit(is_moving)
+
+SOURCE = "mined: matched pixels and Gram similarities"
+_PIXELS, _WINDOW = 2, Window(4, 10)  # of a cell; movers can be five cells from where a static world shows them
+_SMALLEST_SCALE = 0.2  # cells; smaller differences are no motion
+_LARGEST = 8.0  # differences beyond this many scales count as this
+_SURE = 0.1  # weight from which a match tells the scale
+_LEAST_MOTION = 1e-3  # by matches
+_LEAST = 0.2  # sum of the weights of a cell's matches, from which they tell its motion
+_OFFSET, _FLOOR = 0.25, 0.1  # score = log(difference + offset) + log(Gram + floor)
+
+
+@own_settings()
+def mask_by_pixels(result: R, pictures: Iterable[UInt8[np.ndarray, "h w 3"]] | None = None) -> R:
+    """Return the result with the motion and the dynamic mask that its pixels tell, around its cameras and depth.
+
+    Stays as it is: a clip of fewer than three frames or more than 512, or of equal frames, or whose mask was not mined
+    by matches.
+
+    Args:
+        result: cameras and depth that agree with the pixels, with the Gram saliency and the motion by matches.
+        pictures: of the source, in the order of the frames; the result's own images if None.
+
+    Raises ClipError for pictures that are missing, or of another size than the result's.
+    """
+    if not FEWEST_FRAMES <= len(result.depth) <= MOST_FRAMES or result.saliency is None or result.motion is None:
+        return result
+    if all((image == result.images[0]).all() for image in result.images):
+        return result
+    cells = cells_of(result)
+    grey = grey_pictures(result, pictures, cells.grid)
+    motion = pixel_motion(cells, grey, result.saliency, result.motion)
+    pixels = np.stack([_pixels(*each) for each in zip(motion, result.images, strict=True)])
+    mask = np.asarray(_mask(pixels)) & result.inside_pictures & (result.depth != 0)
+    settings = result.settings | {"masks": SOURCE}
+    return dataclasses.replace(result, motion=motion / np.median(motion), dynamic_mask=mask, settings=settings)
+
+
+def pixel_motion(
+    cells: Cells,
+    grey: UInt8[np.ndarray, "S H W"],
+    saliency: Float32[np.ndarray, "S h w"],
+    motion: Float32[np.ndarray, "S h w"],
+) -> Float32[np.ndarray, "S h w"]:
+    """Return the motion of every patch, positive: the geometric mean of what pixels and the network's matches say.
+
+    Pixels say how far they match from where a static world shows them, times the Gram saliency.
+
+    Args:
+        cells: of a static world.
+        grey: pictures, with 12 pixels a cell.
+        saliency: the Gram saliency of every patch, in [0, 1].
+        motion: of every patch by the network's matches, over the clip's median.
+    """
+    S, (h, w), grid = len(grey), saliency.shape[1:], cells.grid
+    expected, warp = expected_matches(cells.depth, cells.cameras, grid)
+    found = match_pixels(at_scale(grey, grid, _PIXELS), expected, warp, grid, _WINDOW)
+    gram, matched = (_resized(each, grid, Image.Resampling.BILINEAR).reshape(S, -1) for each in (saliency, motion))
+    score = np.log(_difference(expected, found) + _OFFSET) + np.log(gram.clip(0, 1) + _FLOOR)
+    score = (score - np.median(score) + np.log(np.maximum(matched, _LEAST_MOTION))) / 2
+    score = np.asarray(voted(score, found.position, VOTE * found.weight, frame_pairs(S), grid))  # type: ignore[arg-type]
+    return _resized(np.exp(score).reshape(S, *grid), (h, w), Image.Resampling.BOX)
+
+
+def _difference(expected: Float32[np.ndarray, "S M P 2"], found: PixelMatches) -> Float32[np.ndarray, "S P"]:
+    """Return how far cells match from where they are expected, over the clip's median; the middle where unknown."""
+    distance, weight = np.linalg.norm(found.position - expected, axis=-1), found.weight
+    sure = distance[weight > _SURE]
+    scale = max(float(np.median(sure)) if len(sure) else 0.0, _SMALLEST_SCALE)
+    total = weight.sum(axis=1)
+    mean = np.sum(weight * np.minimum(distance / scale, _LARGEST), axis=1) / np.maximum(total, _LEAST)
+    return np.where(total > _LEAST, mean, np.median(mean))
+
+
+@jax.jit
+def _pixels(motion: Float[Array, "h w"], image: UInt8[Array, "H W 3"]) -> Float[Array, "H W"]:
+    return motion_pixels(motion[None, None], image[None, None] / jnp.float32(255))[0, 0]
+
+
+def _resized(
+    values: Float32[np.ndarray, "S h w"], size: tuple[int, int], how: Image.Resampling
+) -> Float32[np.ndarray, "S H W"]:
+    pictures = (Image.fromarray(each) for each in values.astype(np.float32))
+    return np.stack([np.asarray(picture.resize((size[1], size[0]), how)) for picture in pictures])

@@ -1,0 +1,1 @@
+"""What is measured and fitted: evaluation, calibration, learning, parity with public code."""
