@@ -3,7 +3,7 @@
 Generated scenes with exact truth, the model that comes with the package, five seeds: each splits the scenes anew into
 those that are fitted to, those that tell when to stop, and those that the scores are of. Run it with
 
-    python docs/notebooks/learned_fusion.py --out learned-fusion
+    python docs/research-notes/learned_fusion.py --out learned-fusion
 
 and look at table.md and the pictures; docs/research-notes/learned-fusion.md says what came out here. The passes over
 the scenes are kept: a second run has only the fits to do.
