@@ -13,7 +13,7 @@ from threading import Lock
 from typing import Any, Literal, NamedTuple
 from urllib.parse import unquote, urlsplit
 
-from vggtjax.errors import InputError, OutputError, VggtjaxError, one_line
+from vggtjax.errors import InputError, OutputError, VggtjaxError, check_extra, one_line
 
 MOST_BYTES = 2**36  # of one download
 _MOST_FILES = 100_000  # of one download
@@ -181,6 +181,7 @@ def write_url(url: str, content: bytes) -> None:
 @contextmanager
 def _opened(url: str, error: type[VggtjaxError]) -> Iterator[tuple[Any, str]]:
     """Yield the file system of a URL and the path in it; whatever it raises becomes `error`, without credentials."""
+    check_extra("a clip or a folder at a URL", "remote", "fsspec")
     from fsspec.core import url_to_fs
 
     options = {}

@@ -28,13 +28,14 @@ EXTRAS: dict[str, tuple[str, tuple[str, ...]]] = {
     "cuda": ("NVIDIA GPUs", ("jax_cuda13_plugin",)),
     "hub": ("models by hub id, such as facebook/VGGT-1B", ("huggingface_hub",)),
     "convert": ("PyTorch checkpoints, .pt and .pth", ("torch",)),
-    "train": ("vggtjax train, and plots of fits", ("optax", "orbax", "matplotlib")),
+    "train": ("vggtjax train, and plots of fits", ("orbax", "matplotlib")),
     "evaluate": ("plots of vggtjax evaluate", ("matplotlib",)),
     "app": ("vggtjax app", ("gradio",)),
     "colmap": ("--refine-cameras, and models of COLMAP", ("pycolmap",)),
     "rerun": ("recordings of rerun by vggtjax export", ("rerun",)),
     "exr": ("OpenEXR files, in and out", ("OpenEXR",)),
-    "cluster": ("batches on many machines, lists in parquet, clips at web addresses", ("ray", "pyarrow", "aiohttp")),
+    "cluster": ("batches on many machines, lists in parquet", ("ray", "pyarrow")),
+    "remote": ("clips and results at URLs", ("fsspec", "aiohttp")),
     "record3d": ("captures of Record3D", ("lzfse",)),
 }
 _HARDWARE = "cuda"  # no use to most, so it is not advised

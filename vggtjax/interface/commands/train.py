@@ -43,7 +43,7 @@ def train(
         steps: total number of steps; phases, warm-up and decay keep their shares. The recipe's own by default.
         options: how the run logs, saves and ends.
     """
-    check_extra("training", "train", "optax", "orbax", "matplotlib")
+    check_extra("training", "train", "orbax", "matplotlib")
     check_file(out / _MODEL, overwrite=True, sources=[] if init is None else [Path(init), Path(init) / _MODEL])
     if steps is not None:  # else it is written as it is
         check_file(out / _RECIPE, overwrite=True, sources=[recipe])
