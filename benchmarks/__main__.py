@@ -12,16 +12,11 @@ from vggtjax.errors import VggtjaxError
 
 COMMANDS = {  # imported where it is called, so that one command needs no other's packages
     "accelerator": "benchmarks.accelerator.command:accelerator",
-    "approximations": "benchmarks.approximations:approximations",
     "consistent-depth": "benchmarks.consistent_depth:consistent_depth",
     "demo-model": "benchmarks.demo_model:demo_model",
     "embed": "benchmarks.embed:embed",
     "gpu-day": "benchmarks.gpu_day.command:gpu_day",
-    "known": "benchmarks.known:known",
-    "long-clips": "benchmarks.long_clips:long_clips",
     "memory": "benchmarks.memory:memory",
-    "refine-cameras": "benchmarks.refine_cameras:refine_cameras",
-    "second-pass": "benchmarks.second_pass:second_pass",
     "speed": "benchmarks.speed:speed",
     "static-mesh": "benchmarks.static_mesh:mesh_distance",
     "suite": "benchmarks.suite.command:suite",
