@@ -33,7 +33,7 @@ Run = Callable[[str, np.ndarray, np.ndarray | None], Outputs]  # work, images [S
 
 def ours(weights: Path, dtype: str) -> Run:
     """Return this library's passes: a plain one, or a whole method."""
-    from vggtjax.storage.kept_memory import keep_freed_memory
+    from vggtjax.storage.malloc import keep_freed_memory
 
     keep_freed_memory()
     import jax

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from converters.files import INDEX, SUFFIXES, choose_file
+from converters.foreign import refuse_foreign
 from converters.hub import COMMIT, download
-from converters.strangers import refuse_strangers
 from vggtjax.errors import CheckpointError, reading
 
 _HUB_ID = re.compile(
@@ -51,7 +51,7 @@ def locate(source: str | Path) -> Weights:
                     "which its page on the hub shows under History"
                 )
             name = source.partition("@")[0]
-            refuse_strangers(name)
+            refuse_foreign(name)
             path, commit = download(hub_id, file, revision)
             return Weights(path, name, commit)
     if source == "demo":

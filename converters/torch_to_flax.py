@@ -17,9 +17,9 @@ import numpy as np
 from flax.traverse_util import unflatten_dict
 
 from converters.files import Tensor, read_state_dict, weight_files
+from converters.foreign import refuse_foreign
 from converters.locate import Weights, locate
 from converters.rules import IGNORED, RULES, Transform
-from converters.strangers import refuse_strangers
 from converters.trained import own_heads, own_names
 from vggtjax.config import VGGT_HEADS, VGGTConfig, vggt_1b
 from vggtjax.errors import CheckpointError, InputError, problems_sentence, reading
@@ -90,7 +90,7 @@ def convert_state_dict(state_dict: Mapping[str, np.ndarray], config: VGGTConfig)
     Raises CheckpointError, which lists unknown, missing, duplicate and mis-shaped keys, and types other than float;
     or names the other network of the state dict.
     """
-    refuse_strangers("the state dict", state_dict)
+    refuse_foreign("the state dict", state_dict)
     tensors = {name: np.asarray(value) for name, value in _own(state_dict, "the state dict").items()}
     targets = plan_conversion(tensors, config)
     flat = {path: np.concatenate(list(target.parts(tensors))) for path, target in targets.items()}
@@ -150,7 +150,7 @@ def convert_weights(
         if os.path.isfile(destination) and os.path.isfile(file) and os.path.samefile(destination, file):  # noqa: PTH113, PTH121
             raise InputError(f"the destination {destination} is the source; choose another name")
     tensors, problems = read_state_dict(weights.path)
-    refuse_strangers(weights.name, tensors)
+    refuse_foreign(weights.name, tensors)
     tensors = _own(tensors, weights.name)
     if with_its_heads:
         config = own_heads(tensors, config, weights.name)
@@ -168,7 +168,7 @@ def convert_weights(
             advance()
 
     sha256 = {file.name: _digest(file, advance) for file in files}
-    refuse_strangers(weights.name, sha256=sha256)
+    refuse_foreign(weights.name, sha256=sha256)
     specs = {path: Spec(target.shape, kind) for path, target in targets.items()}
     labels = {"name": weights.name, "origin": sha256, "revision": weights.revision}
     path = write_checkpoint(destination, specs, parts, config, **labels)
@@ -190,7 +190,7 @@ def _own(tensors: Mapping[str, T], source: str) -> Mapping[str, T]:
     modules = {rule.source.partition(".")[0] for rule in RULES}
     own = own_names(tensors, modules, source)
     if own is not tensors:
-        refuse_strangers(source, own)
+        refuse_foreign(source, own)
     return own
 
 

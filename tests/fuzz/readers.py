@@ -4,6 +4,6 @@ What a reader gives is used as the commands use it: frames are decoded, depth an
 mapped tensors are touched.
 """
 
-from tests.fuzz.rows import own_files, strangers, weights
+from tests.fuzz.rows import foreign, own_files, weights
 
-READERS = (*weights.ROWS, *own_files.ROWS, *strangers.ROWS)
+READERS = (*weights.ROWS, *own_files.ROWS, *foreign.ROWS)

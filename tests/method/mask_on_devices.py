@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from tests.shared.static_world import GRID, PATCH, StaticWorld
-from vggtjax.method.matching.witnesses import Seen
+from vggtjax.method.matching.witnesses import Evidence
 from vggtjax.method.passes import mine
 from vggtjax.network.backbone import ClipBatch
 from vggtjax.network.heads.pose import encode_pose
@@ -57,7 +57,7 @@ saliency[:, :, :2, 1:3] += 1
 tokens = saliency.reshape(1, -1, 48, 1) + generator.normal(0, 0.01, (1, COUNT, 48, 3)).astype(np.float32)
 pictures = generator.random((1, COUNT, *SIZE, 3)).astype(np.float32)
 for method, options in METHODS.items():
-    compare(method, {"clusters": 0, "threshold": "otsu"} | options, Seen(saliency), None, tokens, pictures)
+    compare(method, {"clusters": 0, "threshold": "otsu"} | options, Evidence(saliency), None, tokens, pictures)
 
 world = StaticWorld(COUNT)
 moves = np.zeros((COUNT, *GRID), bool)
@@ -69,7 +69,7 @@ pose = np.asarray(encode_pose(world.cameras.camera_from_world, intrinsics, sides
 images = np.random.default_rng(0).random((COUNT, *depth.shape[1:], 3)).astype(np.float32) / 20 + moving[..., None] / 2
 images += np.linspace(0, 0.3, COUNT, dtype=np.float32)[:, None, None, None]  # not one picture many times
 matches = jax.tree.map(lambda x: np.asarray(x)[None], world.matches(moves.reshape(COUNT, -1)))
-evidence = Seen(np.full((1, *moves.shape), 0.5, np.float32), matches)
+evidence = Evidence(np.full((1, *moves.shape), 0.5, np.float32), matches)
 first = Predictions(pose[None], depth[None].astype(np.float32))
 features = np.zeros((1, COUNT, GRID[0] * GRID[1], 3), np.float32)
 how = {"clusters": 0, "threshold": "otsu"}

@@ -19,9 +19,9 @@ from jaxtyping import Array, Bool, Float, Int
 from vggtjax.config import VGGTConfig, Witness
 from vggtjax.errors import InputError
 from vggtjax.method.assembly import Assembly, FusionRule, as_tree, assemble, check_fuses
-from vggtjax.method.matching.matched_mask import Mined
+from vggtjax.method.matching.matched_mask import MotionMask
 from vggtjax.method.matching.matched_motion import FEWEST_FRAMES
-from vggtjax.method.matching.witnesses import Seen
+from vggtjax.method.matching.witnesses import Evidence
 from vggtjax.method.passes import Passes, first_pass, mine, mine_soft, only, second_pass, track_from
 from vggtjax.method.soft_mask import SoftMasking
 from vggtjax.network.backbone import ClipBatch, encode
@@ -208,13 +208,15 @@ def run_passes(
     else:
         _check_shared(shared, masks, witness)
         batch = ClipBatch(images, shared.patch_tokens, clips.padding(compute.frames))
-        first, seen = shared.first, Seen(shared.saliency, shared.matches)
+        first, seen = shared.first, Evidence(shared.saliency, shared.matches)
 
     # What moves.
     threshold = config.motion.cut_by(options.threshold, method.threshold)
-    mined = Mined(masks)  # type: ignore[arg-type]
+    mined = MotionMask(masks)  # type: ignore[arg-type]
     if masks is None:
-        evidence, predicted = (seen, only(first, FIRST_OUTPUTS)) if mines_by_matches else (Seen(seen.saliency), None)
+        evidence, predicted = (
+            (seen, only(first, FIRST_OUTPUTS)) if mines_by_matches else (Evidence(seen.saliency), None)
+        )
         arrays = (evidence, predicted, batch._replace(frame_count=None))
         mining = step("dynamic mask", mine)
         mined = mining(
@@ -222,9 +224,11 @@ def run_passes(
         )
     elif isinstance(masks, SoftMasking):
         shares = step("dynamic mask", mine_soft)
-        mined = Mined(shares(seen.saliency, images, masks, threshold=config.motion.threshold or "otsu", frames=real))
+        mined = MotionMask(
+            shares(seen.saliency, images, masks, threshold=config.motion.threshold or "otsu", frames=real)
+        )
     elif masks is False:
-        mined = Mined(np.zeros(images.shape[:4], bool))  # type: ignore[arg-type]
+        mined = MotionMask(np.zeros(images.shape[:4], bool))  # type: ignore[arg-type]
 
     # Stage 2: the keys of what moves are suppressed.
     second = first if method.needs_second_pass else None

@@ -14,9 +14,9 @@ from vggtjax.clips.still import same_picture
 from vggtjax.config import Gram, MotionConfig, Suppress, Threshold, VGGTConfig, Witness
 from vggtjax.errors import InputError
 from vggtjax.method.mask import dynamic_tokens, mine_mask
-from vggtjax.method.matching.matched_mask import Mined, mine_matched_mask
+from vggtjax.method.matching.matched_mask import MotionMask, mine_matched_mask
 from vggtjax.method.matching.matches import Matches
-from vggtjax.method.matching.witnesses import Seen, Witnesses
+from vggtjax.method.matching.witnesses import Evidence, Witnesses
 from vggtjax.method.soft_mask import SoftMasking, soft_pixels
 from vggtjax.network.backbone import ClipBatch, patch_grid
 from vggtjax.network.heads.track_head import Tracks
@@ -39,8 +39,8 @@ class Passes(NamedTuple):
     second: Predictions | None
     saliency: Float[Array, "B S h w"]
     dynamic_mask: Bool[Array, "B S H W"] | Float[Array, "B S H W"]
-    motion: Float[Array, "B S h w"] | None = None  # as in `Mined`
-    is_matched: Bool[Array, "B S"] | None = None  # as in `Mined`
+    motion: Float[Array, "B S h w"] | None = None  # as in `MotionMask`
+    is_matched: Bool[Array, "B S"] | None = None  # as in `MotionMask`
     matches: Matches | None = None  # of the first pass, where it gathered them
     patch_tokens: Float[Array, "B S P C"] | None = None  # of the backbone, which both passes share
     tracks: dict[int, Tracks] | None = None  # by the frame of their query points
@@ -57,7 +57,7 @@ def first_pass(
     witness: Witness = "gram",
     outputs: tuple[str, ...] = ("camera", "depth"),
     compute: Compute = Compute(),
-) -> tuple[Predictions, Seen]:
+) -> tuple[Predictions, Evidence]:
     """Run the plain pass and mine the motion saliency inside it; with `query_points`, track them too.
 
     Predictions of padded frames are meaningless. `exponents` has one power per cue, applied before their product. With
@@ -79,7 +79,7 @@ def first_pass(
 
 
 def mine(
-    seen: Seen,
+    seen: Evidence,
     first: Predictions | None,
     clips: ClipBatch,
     *,
@@ -87,7 +87,7 @@ def mine(
     threshold: Threshold,
     smooth_frames: int = 1,
     frames: Frames = Frames(),
-) -> Mined:
+) -> MotionMask:
     """Return the dynamic pixels, by matches if there are any, and what matches say; none where all frames are equal.
 
     Args:
@@ -104,7 +104,7 @@ def mine(
     seen, first, clips = frames.whole((seen, first, clips._replace(frame_count=None)))
     images, size = clips.images, (clips.images.shape[2], clips.images.shape[3])
     how = {"clusters": clusters, "threshold": threshold, "smooth_frames": smooth_frames}
-    mined = Mined(mine_mask(seen.saliency, present(clips.patch_tokens), size, **how))
+    mined = MotionMask(mine_mask(seen.saliency, present(clips.patch_tokens), size, **how))
     if seen.matches is not None:
         first = present(first)
         of_first = (present(first.depth), present(first.pose_encoding))

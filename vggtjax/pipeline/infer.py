@@ -76,8 +76,8 @@ def infer(
     if mesh is not None:
         masks = masks if masks is None or masks is False else by_frame_padded(masks, mesh)  # type: ignore[arg-type]
         params, images, rule = replicate(params, mesh), by_frame_padded(images, mesh), replicate(rule, mesh)
-    given, moves = (None, False) if masks is False else (masks, True)
-    outputs = _infer(params, images, given, rule, config, options, frames, mesh, moves)
+    all_static = masks is False  # it cannot be traced
+    outputs = _infer(params, images, None if all_static else masks, rule, config, options, frames, mesh, all_static)
     return outputs if images.shape[1] == frames else jax.tree.map(lambda x: x[:, :frames], outputs)
 
 
@@ -106,7 +106,7 @@ def _check_range(values: Array | np.ndarray, name: str, remedy: str) -> None:
         raise InputError(f"{name} have values from {low:g} to {high:g}; {remedy}")
 
 
-@partial(jax.jit, static_argnames=("config", "options", "frames", "mesh", "moves"))
+@partial(jax.jit, static_argnames=("config", "options", "frames", "mesh", "all_static"))
 def _infer(
     params: Params,
     images: Array,
@@ -116,9 +116,9 @@ def _infer(
     options: Options,
     frames: int,
     mesh: Mesh | None,
-    moves: bool,
+    all_static: bool,
 ) -> tuple[Assembly, Passes]:
     compute = compute_by(options, Frames(mesh, None if mesh is None else frames))
-    how = {"masks": masks if moves else False, "fusion": fusion, "compute": compute}
+    how = {"masks": False if all_static else masks, "fusion": fusion, "compute": compute}
     assembly, passes = run_method(params, Clips(images, frames=frames), config, options, **how)
     return assembly, passes._replace(matches=None, patch_tokens=None)

@@ -11,7 +11,7 @@ from unittest.mock import patch
 import numpy as np
 
 from tests.fuzz.cases import Reader
-from tests.fuzz.rows.strangers import file
+from tests.fuzz.rows.foreign import file
 from tests.shared.dataset_files import npy
 from tests.shared.room import make_room
 from vggtjax.pipeline.batch.contact import _told as read_card

@@ -13,7 +13,7 @@ import numpy as np
 
 from converters.files import read_state_dict
 from tests.fuzz.cases import Reader
-from tests.fuzz.rows.strangers import file
+from tests.fuzz.rows.foreign import file
 from tests.shared.dataset_files import write
 from tests.shared.tiny import tiny_config
 from vggtjax.config import VGGTConfig

@@ -6,7 +6,7 @@ import pytest
 
 from vggtjax.errors import InputError
 from vggtjax.interface.commands.main import main
-from vggtjax.results.viewer.door import listening
+from vggtjax.results.viewer.access import listening
 
 pytestmark = pytest.mark.skipif(find_spec("gradio") is None, reason="the app needs the extra app")
 

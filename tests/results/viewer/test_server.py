@@ -48,25 +48,25 @@ def test_a_page_asked_for_by_another_name_says_its_address(name):
     """Behind a proxy, as of Jupyter, there is no token that could be brought: none was printed."""
     with served() as server:
         body = get(server, "/", Host=name)[1]
-        for words in (f"answers to this machine alone, as {server.door.url},", f"asked as {name}.", "--host 0.0.0.0"):
+        for words in (f"answers to this machine alone, as {server.access.url},", f"asked as {name}.", "--host 0.0.0.0"):
             assert words in body
     with served(host="0.0.0.0") as server:
         assert "with ?token= at its end; under another name keep that end" in get(server, "/", Host=name)[1]
-        entered = get(server, f"/?token={server.door.token}", Host=name)
+        entered = get(server, f"/?token={server.access.token}", Host=name)
         assert (entered[0], entered[2]["Location"]) == (303, ".")  # under a proxy's folder, too
 
 
 def test_elsewhere_every_request_needs_the_token():
     with served(host="0.0.0.0") as server:
-        assert server.door.token
-        assert server.door.url.endswith(f"/?token={server.door.token}")
+        assert server.access.token
+        assert server.access.url.endswith(f"/?token={server.access.token}")
         cookie = f"vggtjax_{server.server_port}"
         wrong = {"Cookie": f"{cookie}=wrong"}
         for path, headers in (("/", {}), ("/?token=%C3%A9", {}), ("/", wrong), ("/", UPGRADE), ("/any", {})):
             status, body, _ = get(server, path, **headers)
             assert status == 403
             assert "the page" not in body
-        status, _, headers = get(server, f"/?token={server.door.token}")
+        status, _, headers = get(server, f"/?token={server.access.token}")
         assert (status, headers["Location"]) == (303, ".")
         assert "HttpOnly" in headers["Set-Cookie"]
         assert get(server, "/", Cookie=headers["Set-Cookie"].split(";")[0])[:2] == (200, "<p>the page</p>")

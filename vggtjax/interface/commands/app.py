@@ -38,7 +38,7 @@ def app(
         password: what people sign in with, as the user vggtjax; at least 8 characters
         limits: what users may ask
     """
-    from vggtjax.results.viewer.door import Door, is_loopback, listening
+    from vggtjax.results.viewer.access import Access, is_loopback, listening
 
     if password is None and not is_loopback(host):
         raise InputError(
@@ -62,7 +62,7 @@ def app(
         from vggtjax.interface.app.page import USER, serve
 
         sign_in = f", and sign in as {USER} with the password" if password else ""
-        opening = f"Open {Door(host, port, None).url}{sign_in}  (Ctrl+C ends the app)"
+        opening = f"Open {Access(host, port, None).url}{sign_in}  (Ctrl+C ends the app)"
         serve(runner, Path(folder), host, port, password, lambda: report.line(opening))
     handled()
 

@@ -40,7 +40,7 @@ from vggtjax.interface.commands.train import train
 from vggtjax.interface.commands.view import view
 from vggtjax.storage.cache import enable_compilation_cache
 from vggtjax.storage.interruption import message as message_of_interruption
-from vggtjax.storage.kept_memory import keep_freed_memory
+from vggtjax.storage.malloc import keep_freed_memory
 
 _START, _RESULTS, _MODELS = "Start", "Look at results, and pass them on", "Models"
 _MEASURE, _COMPUTER = "Measure", "This computer"

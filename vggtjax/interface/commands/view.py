@@ -108,12 +108,12 @@ def serve(report: Report, results: Sequence[Result], names: Sequence[str], servi
             from vggtjax.results.viewer.scene import Budget
 
             server.page = viewer_page(results, names=names, budget=Budget(*_POINTS), progress=progress).encode()
-        report.line(f"The viewer: {server.door.url}   (Ctrl-C ends it)")
+        report.line(f"The viewer: {server.access.url}   (Ctrl-C ends it)")
         if connection := os.environ.get("SSH_CONNECTION", "").split():
-            if server.door.token is None:
+            if server.access.token is None:
                 port = server.server_port
                 report.line(f"On your own machine, first: ssh -L {port}:{serving.host}:{port} {connection[2]}")
-        elif not serving.no_browser and not _open_browser(server.door.url):
+        elif not serving.no_browser and not _open_browser(server.access.url):
             report.line("No browser could be opened here; open the address in one.")
         try:
             server.serve_forever()

@@ -19,7 +19,7 @@ from vggtjax.network.heads.pose import decode_pose
 _TIMES_MEDIAN = 2.5  # Otsu's threshold alone would find something in static clips
 
 
-class Mined(NamedTuple):
+class MotionMask(NamedTuple):
     """Dynamic pixels of clips, and what matches say; None where no matches were asked for, and for a single frame."""
 
     dynamic_mask: Bool[Array, "B S H W"]
@@ -34,7 +34,7 @@ def mine_matched_mask(
     images: Float[Array, "B S H W 3"],
     depth: Float[Array, "B S H W"],
     pose_encoding: Float[Array, "B S 9"],
-) -> Mined:
+) -> MotionMask:
     """Return dynamic pixels by matches. No gradient passes: a mask is a decision.
 
     A clip of fewer than three frames, or whose matches do not come back, has its mask by the Gram saliency.
@@ -49,14 +49,14 @@ def mine_matched_mask(
     """
     S, grid = images.shape[1], (saliency.shape[2], saliency.shape[3])
     if S < FEWEST_FRAMES:
-        return Mined(gram_mask, jnp.ones_like(saliency), jnp.zeros(gram_mask.shape[:2], bool))
+        return MotionMask(gram_mask, jnp.ones_like(saliency), jnp.zeros(gram_mask.shape[:2], bool))
     cameras = Cameras(*decode_pose(pose_encoding, grid))  # intrinsics in patches
     inputs = jax.lax.stop_gradient((matches, saliency, at_patches(depth, grid), cameras))
     found = jax.lax.map(lambda clip: motion(clip[0], clip[1].reshape(S, -1), clip[2], clip[3], grid), inputs)
     score = jnp.nan_to_num(found.score).reshape(-1, S, *grid)
     mask = jax.vmap(is_moving)(motion_pixels(score, images))
     mask = jnp.where(found.is_matched[:, None, None, None], mask, gram_mask)
-    return Mined(mask, score, jnp.broadcast_to(found.is_matched[:, None], mask.shape[:2]))
+    return MotionMask(mask, score, jnp.broadcast_to(found.is_matched[:, None], mask.shape[:2]))
 
 
 def motion_pixels(motion: Float[Array, "B S h w"], images: Float[Array, "B S H W 3"]) -> Float[Array, "B S H W"]:

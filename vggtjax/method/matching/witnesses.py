@@ -12,11 +12,11 @@ from vggtjax.config import Gram, MotionConfig, Witness
 from vggtjax.method.cues import GramCues
 from vggtjax.method.matching.matches import DenseMatches, Matches
 from vggtjax.network.aggregator import Accumulator
+from vggtjax.network.kernels.accumulators import Accumulators
 from vggtjax.network.kernels.frames import Frames
-from vggtjax.network.kernels.together import Together
 
 
-class Seen(NamedTuple):
+class Evidence(NamedTuple):
     """What the first pass sees of motion."""
 
     saliency: Float[Array, "B S h w"]  # of the Gram similarities
@@ -41,14 +41,14 @@ class Witnesses:
         if self.witness == "gram":
             return self._cues
         matches = DenseMatches(self.motion.matching_layers(self.depth), self.depth, self.grid, self.frames)
-        return Together((self._cues, matches), self.frames)
+        return Accumulators((self._cues, matches), self.frames)
 
-    def seen(self, sums: Any, B: int, S: int, exponents: Float[Array, " cues"] | None = None) -> Seen:
+    def seen(self, sums: Any, B: int, S: int, exponents: Float[Array, " cues"] | None = None) -> Evidence:
         """Return what the sums of a pass show; a saliency of 0 where nothing was summed up, as of a single frame."""
         if sums is None:
-            return Seen(jnp.zeros((B, S, *self.grid)))
+            return Evidence(jnp.zeros((B, S, *self.grid)))
         of_cues, matches = (sums, None) if self.witness == "gram" else sums
-        return Seen(self._cues.saliency(of_cues, exponents).reshape(B, S, *self.grid), matches)
+        return Evidence(self._cues.saliency(of_cues, exponents).reshape(B, S, *self.grid), matches)
 
     @property
     def _cues(self) -> GramCues:

@@ -29,7 +29,7 @@ def map_chunks(function: Callable[[_Rows, int], _Outputs], rows: _Rows) -> _Outp
     if _count(rows) <= _rows_on_cpu(rows):  # the code below is traced for every platform
         return function(rows, _count(rows))
 
-    def at_most(most: int, multiple: int) -> Callable[[_Rows], _Outputs]:
+    def in_pieces(most: int, multiple: int) -> Callable[[_Rows], _Outputs]:
         def mapped(rows):
             count = _count(rows)
             if (size := piece_size(count, most, multiple)) is None:
@@ -39,7 +39,7 @@ def map_chunks(function: Callable[[_Rows, int], _Outputs], rows: _Rows) -> _Outp
 
         return mapped
 
-    return _by_platform(at_most, rows)
+    return _by_platform(in_pieces, rows)
 
 
 def map_chunks_in_place(
@@ -49,7 +49,7 @@ def map_chunks_in_place(
     if len(x) <= _rows_on_cpu(x):
         return function(x, others)
 
-    def at_most(most: int, multiple: int):
+    def in_pieces(most: int, multiple: int):
         def replaced(rows):
             if (size := piece_size(len(x), most, multiple)) is None:
                 return function(*_padded(rows, multiple))[: len(x)]
@@ -64,7 +64,7 @@ def map_chunks_in_place(
 
         return replaced
 
-    return _by_platform(at_most, (x, others))
+    return _by_platform(in_pieces, (x, others))
 
 
 def times_for_cores() -> int:
@@ -91,9 +91,9 @@ def piece_size(count: int, most: int, multiple: int = 1) -> int | None:
     return best[0]
 
 
-def _by_platform(at_most, rows):
-    elsewhere = at_most(ROWS_ELSEWHERE, _MULTIPLE)
-    return jax.lax.platform_dependent(rows, cpu=at_most(_rows_on_cpu(rows), 1), default=elsewhere)
+def _by_platform(in_pieces, rows):
+    elsewhere = in_pieces(ROWS_ELSEWHERE, _MULTIPLE)
+    return jax.lax.platform_dependent(rows, cpu=in_pieces(_rows_on_cpu(rows), 1), default=elsewhere)
 
 
 def _rows_on_cpu(rows) -> int:

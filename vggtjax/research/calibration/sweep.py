@@ -17,7 +17,7 @@ from vggtjax.config import Cue, Gram, MotionConfig, VGGTConfig
 from vggtjax.errors import InputError, device_memory_errors
 from vggtjax.method.cues import GramCues, Sums, normalise
 from vggtjax.network.backbone import patch_grid
-from vggtjax.network.kernels.together import Together
+from vggtjax.network.kernels.accumulators import Accumulators
 from vggtjax.network.layers import Params
 from vggtjax.network.model import forward
 from vggtjax.progress import Progress, no_progress
@@ -193,6 +193,6 @@ def token_auc(values: Float[np.ndarray, "N S P"], truth: Int8[np.ndarray, "N S P
 def _measure(
     params: Params, images: Float[Array, "B S H W 3"], config: VGGTConfig, cues: SweepCues
 ) -> tuple[Float[Array, "G C L B S P"], Float[Array, "G B S P"], Float[Array, "L B"]]:
-    together = Together((cues, CameBack(config.depth, patch_grid(images, config))))
+    together = Accumulators((cues, CameBack(config.depth, patch_grid(images, config))))
     of_cues, came_back = forward(params, images, config, outputs=(), cues=together).cue_sums
     return *cues.measured(of_cues), came_back

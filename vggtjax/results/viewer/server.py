@@ -6,7 +6,7 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from urllib.parse import urlsplit
 
-from vggtjax.results.viewer.door import Door, listening, token_for
+from vggtjax.results.viewer.access import Access, listening, token_for
 
 _SILENCE = 30  # seconds after which a connection that says nothing is closed
 
@@ -35,7 +35,7 @@ class PageServer(ThreadingHTTPServer):
         self.socket.close()
         self.socket, self.server_address = opened, opened.getsockname()
         self.server_name, self.server_port = host, opened.getsockname()[1]
-        self.door = Door(host, self.server_port, token_for(host))
+        self.access = Access(host, self.server_port, token_for(host))
 
     def handle_error(self, request: object, client_address: object) -> None:
         """Say nothing of a browser that hangs up."""
@@ -47,15 +47,15 @@ class _Handler(BaseHTTPRequestHandler):
     server_version, sys_version = "vggtjax", ""
 
     def do_GET(self) -> None:
-        address, door = urlsplit(self.path), self.server.door
+        address, access = urlsplit(self.path), self.server.access
         host = self.headers.get("Host", "")
-        admitted = door.admits(host, address.query, self.headers.get("Cookie", ""))
+        admitted = access.admits(host, address.query, self.headers.get("Cookie", ""))
         if admitted == "closed":
-            self._answer(HTTPStatus.FORBIDDEN, f"{door.refusal(host)}\n".encode())
+            self._answer(HTTPStatus.FORBIDDEN, f"{access.refusal(host)}\n".encode())
         elif address.path != "/":
             self._answer(HTTPStatus.NOT_FOUND, b"There is only one page here: /\n")
         elif admitted == "enter":
-            self._answer(HTTPStatus.SEE_OTHER, b"", **{"Location": ".", "Set-Cookie": door.cookie})
+            self._answer(HTTPStatus.SEE_OTHER, b"", **{"Location": ".", "Set-Cookie": access.cookie})
         else:
             self._answer(HTTPStatus.OK, self.server.page, "text/html")
 

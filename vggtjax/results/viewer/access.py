@@ -34,7 +34,7 @@ def listening(host: str, port: int) -> socket.socket:
 
 
 @dataclass(frozen=True)
-class Door:
+class Access:
     """The one address of a server. Without a token it opens to requests that name this machine or `host`."""
 
     host: str

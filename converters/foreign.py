@@ -20,7 +20,7 @@ class Stranger(NamedTuple):
 
 
 # From the projects' public code. StreamVGGT's code loads VGGT's weights strictly, so the keys are equal.
-STRANGERS = (
+FOREIGN = (
     Stranger(
         "StreamVGGT",
         "its keys are VGGT's, but its global attention is causal: a frame reads earlier frames only",
@@ -47,14 +47,14 @@ STRANGERS = (
 )
 
 
-def refuse_strangers(source: str, keys: Iterable[str] = (), sha256: Mapping[str, str] | None = None) -> None:
+def refuse_foreign(source: str, keys: Iterable[str] = (), sha256: Mapping[str, str] | None = None) -> None:
     """Raise CheckpointError for a checkpoint of a network related to VGGT.
 
     `source` is the name of the weights, a hub id or the name of their file or folder; `keys` are of the tensors,
     `sha256` of the files.
     """
     keys = list(keys)
-    for stranger in STRANGERS:
+    for stranger in FOREIGN:
         has_its_name = re.search(stranger.source, source.lower())
         has_its_content = set((sha256 or {}).values()) & set(stranger.sha256)
         if has_its_name or has_its_content or any(re.match(stranger.key, key) for key in keys):

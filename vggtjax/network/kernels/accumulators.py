@@ -15,7 +15,7 @@ from vggtjax.network.kernels.frames import Frames
 
 
 @dataclass(frozen=True)
-class Together:
+class Accumulators:
     """An `Accumulator` of several, whose sums are the tuple of theirs. Where devices share the frames, one by one."""
 
     parts: tuple[Accumulator, ...]

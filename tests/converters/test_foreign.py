@@ -7,8 +7,8 @@ import pytest
 from safetensors.numpy import save_file
 
 from converters import convert, convert_state_dict
+from converters.foreign import FOREIGN, refuse_foreign
 from converters.locate import locate
-from converters.strangers import STRANGERS, refuse_strangers
 from tests.shared.seeded import seeded_state_dict
 from vggtjax.errors import CheckpointError
 
@@ -46,8 +46,8 @@ def test_streamvggt_is_known_by_its_name_or_its_content(state_dict, config, tmp_
     path = path.rename(tmp_path / "checkpoints.safetensors")
     digest = convert(path, tmp_path / "x.safetensors", config=config).sha256["checkpoints.safetensors"]
     (tmp_path / "x.safetensors").unlink()
-    known = [stranger._replace(sha256=(digest,)) if stranger.sha256 else stranger for stranger in STRANGERS]
-    monkeypatch.setattr("converters.strangers.STRANGERS", known)
+    known = [stranger._replace(sha256=(digest,)) if stranger.sha256 else stranger for stranger in FOREIGN]
+    monkeypatch.setattr("converters.foreign.FOREIGN", known)
     with pytest.raises(CheckpointError, match="checkpoints is a checkpoint of StreamVGGT"):
         convert(path, tmp_path / "x.safetensors", config=config)
     assert not (tmp_path / "x.safetensors").exists()
@@ -56,5 +56,5 @@ def test_streamvggt_is_known_by_its_name_or_its_content(state_dict, config, tmp_
 def test_vggt_itself_is_no_stranger(golden):
     keys = json.loads((golden / "shapes_vggt_1b.json").read_text())
     for name in ("facebook/VGGT-1B", "facebook/VGGT-1B-Commercial", "model_tracker_fixed_e20", "vggt_1B_commercial"):
-        refuse_strangers(name, keys)
-    refuse_strangers("ddp", [f"module.{key}" for key in keys])  # unknown keys, but nobody's in particular
+        refuse_foreign(name, keys)
+    refuse_foreign("ddp", [f"module.{key}" for key in keys])  # unknown keys, but nobody's in particular
