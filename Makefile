@@ -38,7 +38,15 @@ SLOW = parity network method pipeline training research interface benchmarks tes
 # Processes of the tests read compiled Python files rather than compile them anew, whatever the shell says.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo pictures reference docs test proofs accelerator accelerator-check compiler-is-there gpu-day-wheels mutants check fast coverage shuffled lint format clean locked lock audit sbom dist
+.PHONY: ci demo pictures reference docs test proofs accelerator accelerator-check compiler-is-there gpu-day-wheels mutants check fast coverage shuffled lint format clean locked lock audit sbom dist
+
+# What the repository's checks run, on a clean checkout; programs for GPUs where pip finds their compiler.
+ci:
+	$(MAKE) demo
+	$(MAKE) lint
+	$(MAKE) test
+	$(MAKE) docs
+	if $(MAKE) compiler-is-there; then $(MAKE) accelerator-check; else echo "pip finds no compiler for GPUs"; fi
 
 demo: $(VENV)/.runtime
 	$(BIN)/vggtjax demo --out demo-output
