@@ -76,7 +76,7 @@ class Sustained:
 
     def __init__(self, function: Callable[..., Any], arguments: tuple) -> None:
         self._arguments = arguments
-        self._compiled = jax.jit(full_precision(function)).lower(*arguments).compile()
+        self._compiled = jax.jit(full_precision()(function)).lower(*arguments).compile()
         self._series(1)
         self._count = min(max(math.ceil(_SUSTAINED / self._series(1)), 1), 1000)
 

@@ -27,7 +27,7 @@ class Clusters(NamedTuple):
     inertia: Float[Array, ""]  # sum of weighted squared distances to the nearest centre
 
 
-@full_precision
+@full_precision()
 def kmeans(
     key: Array,
     points: Float[Array, "N C"],

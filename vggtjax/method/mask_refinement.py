@@ -151,7 +151,7 @@ def cluster_points(
 
 
 @partial(jax.jit, static_argnames="clusters")
-@full_precision
+@full_precision()
 def cluster_losses(
     images: Float[Array, "S H W 3"],
     depth: Float[Array, "S H W"],

@@ -4,27 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from vggtjax.config import VGGTConfig
+from vggtjax.config import Suppress, VGGTConfig
 from vggtjax.errors import InputError
-from vggtjax.network.block import Block, apply_block, with_remat_policy
+from vggtjax.network.block import Block, StoredBlock, stored
+from vggtjax.network.kernels.captured import Capture, joined, nothing_captured
 from vggtjax.network.kernels.frames import Frames
 from vggtjax.network.kernels.in_place import replaced_if
 from vggtjax.network.kernels.sampled import early_pairs, frames_alone, sampled_attention
-from vggtjax.network.layers import Params, apply, stack
-from vggtjax.network.precision import Compute, full_precision, upcast
-from vggtjax.network.rope import rope_table
+from vggtjax.network.layers import TABLE, over_layers
+from vggtjax.network.precision import Compute, upcast
+from vggtjax.network.rope import Rope, rope_table
 from vggtjax.network.suppression import Attend, SuppressedKeys, Suppression, suppressed_attention
 
 REGISTERS = 4
-_CAPTURED_ROWS = 2**16  # at once: they take 0.5 GB in float32
 SPECIAL_TOKENS = 1 + REGISTERS  # camera token, registers
 
 # (S, grid, special tokens) -> attention over the S frames of a clip
@@ -32,8 +32,6 @@ GLOBAL_ATTENTION: Mapping[str, Callable[[int, tuple[int, int], int], Attend]] = 
     "exact": lambda S, grid, special_tokens: suppressed_attention,
     "sampled": sampled_attention,
 }
-
-Capture = Callable[[Float[Array, "B S T E"]], Any]
 
 
 class Accumulator(Protocol):
@@ -68,49 +66,83 @@ def identity(tokens: Float[Array, "B S T E"]) -> Float[Array, "B S T E"]:
     return tokens
 
 
-@full_precision
-def aggregate(
-    params: Params,
-    patch_tokens: Float[Array, "B S P C"],
-    config: VGGTConfig,
-    grid: tuple[int, int],
-    *,
-    captures: Sequence[Capture],
-    accumulator: Accumulator | None = None,
-    frame_count: Int[Array, " B"] | None = None,
-    suppression: Suppression = Suppression(),
-    compute: Compute = Compute(),
-) -> tuple[Float[Array, "B S E"], tuple[Any, ...], Any]:
-    """Run the alternating blocks; return the last pair's camera tokens, the captured taps, and the accumulated sums.
+class Carry(NamedTuple):
+    """What a pair of blocks hands to the next."""
 
-    Args:
-        params: the model's parameter tree (`aggregator` is read).
-        patch_tokens: what `encode` returned.
-        config: the model's configuration.
-        grid: rows and columns of patches, h and w.
-        captures: one function per entry of `config.taps`, from tokens [B, S, T, 2C] to any tree of arrays. Only these
-            trees are stored, and only of the tapped pairs.
-        accumulator: what to sum over q and k of the global blocks, such as motion cues, or None.
-        frame_count: number of real frames of each clip, at least one; padded frames follow and do not change them.
-        suppression: the keys to suppress, in both blocks of a pair.
-        compute: type of the products; how global attention is computed; with `remat`, only the input of every pair is
-            stored for the gradient; where the frames are: global attention gathers keys and values, all else is local.
+    tokens: Float[Array, "BST C"]
+    camera: Float[Array, "B S E"]  # camera tokens of its frame and its global block, E = 2C
+    taps: tuple[Any, ...]  # captured so far
+    sums: Any  # of the accumulator so far
+
+
+class PairInputs(NamedTuple):
+    """What differs from pair to pair."""
+
+    suppression: Bool[Array, ""] | Float[Array, ""]  # whether it suppresses keys, or how far
+    is_tapped: Bool[Array, " taps"]
+    counts: Int[Array, ...] | None  # how often the accumulator reads it
+    is_early: Bool[Array, ""] | None  # whether global attention sees the own frame alone; None: never
+
+
+class Pair(nn.Module):
+    """A frame block, in which tokens attend to those of their frame, and a global block, to those of all frames.
+
+    Attributes:
+        frame_block, global_block: the two blocks.
+        shape: B clips of S frames of T tokens with C channels.
+        rope: the angles of a frame's tokens.
+        attend: global attention.
+        captures, accumulator, frame_count: as of `Aggregator`.
+        hidden: tokens whose keys are suppressed, or their shares; None: none.
+        suppress: how keys are suppressed.
+        is_real: tokens of frames that are not padding; None: all.
+        frames: where the frames are.
     """
-    return apply(
-        Aggregator(config),
-        params["aggregator"],
-        patch_tokens,
-        grid,
-        captures,
-        accumulator=accumulator,
-        frame_count=frame_count,
-        suppression=suppression,
-        compute=compute,
-    )
+
+    frame_block: Block
+    global_block: Block
+    shape: tuple[int, int, int, int]
+    rope: Rope
+    attend: Attend
+    captures: Sequence[Capture]
+    accumulator: Accumulator | None
+    frame_count: Int[Array, " B"] | None
+    hidden: Bool[Array, "B S T"] | Float[Array, "B S T"] | None
+    suppress: Suppress
+    is_real: Bool[Array, "B ST"] | None
+    frames: Frames
+
+    @nn.compact  # captures may make modules of their own
+    def __call__(self, carry: Carry, inputs: PairInputs) -> tuple[Carry, None]:
+        """Return what the next pair receives."""
+        (B, S, T, C), frames, sums = self.shape, self.frames, carry.sums
+        within = partial(suppressed_attention, suppressed=self._suppressed(inputs, B * S))
+        among = self.attend if inputs.is_early is None else frames_alone(S, self.attend, inputs.is_early)
+        among = partial(among, suppressed=self._suppressed(inputs, B), is_real=self.is_real)
+
+        frame, _, _ = self.frame_block(carry.tokens.reshape(B * S, T, C), self.rope, within)
+        x, q, k = self.global_block(frame.reshape(B, S * T, C), self.rope, among)
+
+        if self.accumulator is not None:
+            q, k = (a.reshape(B, S, T, *a.shape[2:]) for a in (q, k))
+            x, (q, k) = frames.in_order(x, (q, k))  # in the gradient, cues communicate before attention does
+            counts = frames.after(inputs.counts, x)  # and here, after it
+            sums = self.accumulator.add(sums, counts, q, k, self.frame_count)
+        taps = tuple(
+            jax.named_scope(f"tap{i}")(replaced_if)(inputs.is_tapped[i], tap, joined(capture, self.shape), frame, x)
+            for i, (capture, tap) in enumerate(zip(self.captures, carry.taps, strict=True))
+        )
+        camera = [tokens.reshape(B, S, T, C)[:, :, 0] for tokens in (frame, x)]
+        return Carry(x.reshape(B * S * T, C), jnp.concatenate(camera, axis=-1), taps, sums), None
+
+    def _suppressed(self, inputs: PairInputs, sequences: int) -> SuppressedKeys | None:
+        if self.hidden is None:
+            return None
+        return SuppressedKeys(self.hidden.reshape(sequences, -1), inputs.suppression, self.suppress)
 
 
 class Aggregator(nn.Module):
-    """Camera and register tokens, and pairs of blocks; arguments as those of `aggregate`."""
+    """Camera and register tokens before the patches of each frame, and pairs of blocks."""
 
     config: VGGTConfig
 
@@ -126,64 +158,63 @@ class Aggregator(nn.Module):
         suppression: Suppression = Suppression(),
         compute: Compute = Compute(),
     ) -> tuple[Float[Array, "B S E"], tuple[Any, ...], Any]:
-        """Return the last pair's camera tokens, the captured taps, and the accumulated sums."""
-        config = self.config
+        """Return the last pair's camera tokens, the captured taps, and the accumulated sums.
+
+        Args:
+            patch_tokens: what `encode` returned.
+            grid: rows and columns of patches, h and w.
+            captures: one function per entry of `config.taps`, from tokens [B, S, T, 2C] to any tree of arrays. Only
+                these trees are stored, and only of the tapped pairs.
+            accumulator: what to sum over q and k of the global blocks, such as motion cues, or None.
+            frame_count: number of real frames of each clip, at least one; padded frames follow and do not change them.
+            suppression: the keys to suppress, in both blocks of a pair.
+            compute: type of the products; how global attention is computed; with `remat`, only the input of every pair
+                is stored for the gradient; where the frames are: global attention gathers keys and values, all else is
+                local.
+        """
+        config, frames = self.config, compute.frames
         B, S, P, C = patch_tokens.shape
         T = SPECIAL_TOKENS + P
-        block = Block(config.num_heads, qk_norm=True, dtype=jnp.dtype(compute.compute_dtype))
-        attend = _global_attention(compute, S, grid)
-        global_block = block.clone(attend=attend)
-        rope = rope_table(grid, SPECIAL_TOKENS, C // config.num_heads)
-        frames = compute.frames
         real = frames.are_real(frame_count, B, S)
-        real_tokens = None if real is None else jnp.repeat(real, T, axis=1)
-        hidden = suppression.hidden_tokens(SPECIAL_TOKENS)
-
-        def suppressed(active: Array, rows: int) -> SuppressedKeys | None:
-            return None if hidden is None else SuppressedKeys(hidden.reshape(rows, -1), active, suppression.suppress)
-
-        def pair(carry, layer):
-            x, _, taps, sums = carry
-            frame_params, global_params, active, tapped, counts, early = layer
-            x, _, _ = apply_block(block, frame_params, x.reshape(B * S, T, C), rope, suppressed(active, B * S))
-            frame = x
-            here = global_block if early is None else global_block.clone(attend=frames_alone(S, attend, early))
-            x, q, k = apply_block(here, global_params, x.reshape(B, S * T, C), rope, suppressed(active, B), real_tokens)
-            if accumulator is not None:
-                q, k = (a.reshape(B, S, T, *a.shape[2:]) for a in (q, k))
-                x, (q, k) = frames.in_order(x, (q, k))  # in the gradient, cues communicate before attention does
-                sums = accumulator.add(sums, frames.after(counts, x), q, k, frame_count)  # and here, after it
-            taps = tuple(
-                jax.named_scope(f"tap{i}")(replaced_if)(tapped[i], tap, _joined(capture, (B, S, T, C)), frame, x)
-                for i, (capture, tap) in enumerate(zip(captures, taps, strict=True))
-            )
-            camera = [tokens.reshape(B, S, T, C)[:, :, 0] for tokens in (frame, x)]
-            return (x.reshape(B * S * T, C), jnp.concatenate(camera, axis=-1), taps, sums), None
-
         if real is not None:  # 0 x NaN is NaN: padded frames are set to 0
             patch_tokens = jnp.where(real[:, :, None, None], patch_tokens, 0)
         tokens = self._tokens(upcast(patch_tokens), frames)
-        layers = (
-            stack(self, "frame_blocks", block, config.depth, tokens[0]),
-            stack(self, "global_blocks", block, config.depth, tokens[0]),
-            suppression.active(config.depth, config.motion.mask_pairs),
-            jnp.asarray(np.arange(config.depth)[:, None] == np.asarray(config.taps)[None]),
-            None if accumulator is None else jnp.asarray(accumulator.layer_counts()),
-            jnp.asarray(early_pairs(config.depth)) if compute.attention == "sampled" else None,
+
+        block = partial(StoredBlock, config.num_heads, qk_norm=True, dtype=jnp.dtype(compute.compute_dtype))
+        pairs = over_layers(Pair, config.depth, store=stored(remat=compute.remat))(
+            block(name="frame_blocks"),
+            block(name="global_blocks"),
+            shape=(B, S, T, C),
+            rope=rope_table(grid, SPECIAL_TOKENS, C // config.num_heads),
+            attend=_global_attention(compute, S, grid),
+            captures=captures,
+            accumulator=accumulator,
+            frame_count=frame_count,
+            hidden=suppression.hidden_tokens(SPECIAL_TOKENS),
+            suppress=suppression.suppress,
+            is_real=None if real is None else jnp.repeat(real, T, axis=1),
+            frames=frames,
         )
-        sums = None if accumulator is None else frames.varying(accumulator.zeros(B, S, P))
-        camera = frames.varying(jnp.zeros((B, S, 2 * C), tokens.dtype))
-        taps = frames.varying(tuple(_empty(capture, (B, S, T, 2 * C), tokens.dtype) for capture in captures))
-        step = with_remat_policy(pair, remat=compute.remat)
-        start = (tokens.reshape(B * S * T, C), camera, taps, sums)
-        (_, camera, taps, sums), _ = jax.lax.scan(step, start, layers)
-        return camera, taps, sums
+        empty = Carry(
+            tokens.reshape(B * S * T, C),
+            camera=frames.varying(jnp.zeros((B, S, 2 * C), tokens.dtype)),
+            taps=frames.varying(nothing_captured(captures, (B, S, T, 2 * C), tokens.dtype)),
+            sums=None if accumulator is None else frames.varying(accumulator.zeros(B, S, P)),
+        )
+        inputs = PairInputs(
+            suppression.active(config.depth, config.motion.mask_pairs),
+            is_tapped=jnp.asarray(np.arange(config.depth)[:, None] == np.asarray(config.taps)[None]),
+            counts=None if accumulator is None else jnp.asarray(accumulator.layer_counts()),
+            is_early=jnp.asarray(early_pairs(config.depth)) if compute.attention == "sampled" else None,
+        )
+        last, _ = pairs(empty, inputs)
+        return last.camera, last.taps, last.sums
 
     def _tokens(self, patch_tokens: Float[Array, "B S P C"], frames: Frames) -> Float[Array, "B S T C"]:
         """Prepend camera and register tokens: variant 0 for the clip's first frame, variant 1 for all others."""
         B, S, _, C = patch_tokens.shape
-        camera = self.param("camera_token", nn.initializers.zeros, (2, 1, C))
-        registers = self.param("register_tokens", nn.initializers.zeros, (2, REGISTERS, C))
+        camera = self.param("camera_token", TABLE, (2, 1, C))
+        registers = self.param("register_tokens", TABLE, (2, REGISTERS, C))
         special = jnp.concatenate([camera, registers], axis=1)  # [2, 5, C]
         special = special.astype(patch_tokens.dtype)[(frames.numbers(S) > 0).astype(int)]  # [S, 5, C]
         return jnp.concatenate([jnp.broadcast_to(special, (B, S, SPECIAL_TOKENS, C)), patch_tokens], axis=2)
@@ -197,39 +228,3 @@ def _global_attention(compute: Compute, S: int, grid: tuple[int, int]) -> Attend
     if compute.attention != "exact":
         raise InputError(f"attention is {compute.attention!r} on several devices; expected 'exact', or one device")
     return partial(suppressed_attention, frames=compute.frames)
-
-
-def _joined(capture: Capture, shape: tuple[int, int, int, int]) -> Callable[[Array, Array], Any]:
-    """Return what captures a tapped pair: its frame and global outputs, joined; on an accelerator some frames at once.
-
-    The rows of many frames, joined and normalised in float32, would be the most that a pass holds.
-    """
-    B, S, T = shape[:3]
-    pieces = -(-S // max(_CAPTURED_ROWS // (B * T), 1))
-    at_once = -(-S // pieces)
-    starts = np.minimum(at_once * np.arange(pieces), S - at_once)  # the last piece overlaps the one before it
-    owner = np.minimum(np.arange(S) // at_once, pieces - 1)
-    taken = at_once * owner + np.arange(S) - starts[owner]  # of every frame, among those of all pieces
-
-    def captured(frame: Array, x: Array) -> Any:
-        return capture(jnp.concatenate([frame.reshape(shape), x.reshape(shape)], axis=-1))
-
-    def in_pieces(frame: Array, x: Array) -> Any:
-        def of_piece(start: Array) -> Any:
-            some = [jax.lax.dynamic_slice_in_dim(a.reshape(shape), start, at_once, axis=1) for a in (frame, x)]
-            return capture(jnp.concatenate(some, axis=-1))
-
-        def of_frames(leaf: Array) -> Array:
-            leaf = jnp.moveaxis(leaf, 0, 1).reshape(B, pieces * at_once, *leaf.shape[3:])
-            return leaf if pieces * at_once == S else leaf[:, taken]
-
-        return jax.tree.map(of_frames, jax.lax.map(of_piece, jnp.asarray(starts)))  # [pieces, B, at once, ...]
-
-    if pieces == 1:
-        return captured
-    return lambda frame, x: jax.lax.platform_dependent(frame, x, cpu=captured, default=in_pieces)
-
-
-def _empty(capture: Capture, shape: tuple[int, ...], dtype: Any) -> Any:
-    shapes = jax.eval_shape(capture, jax.ShapeDtypeStruct(shape, dtype))
-    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)

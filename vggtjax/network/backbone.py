@@ -11,9 +11,9 @@ from jaxtyping import Array, Float, Int
 
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
-from vggtjax.network.block import Block, apply_block, with_remat_policy
+from vggtjax.network.block import BlockLayer, StoredBlock, stored
 from vggtjax.network.given import as_images, check_floats
-from vggtjax.network.layers import Conv, LayerNorm, Params, apply, stack
+from vggtjax.network.layers import TABLE, Conv, LayerNorm, Params, over_layers
 from vggtjax.network.precision import check_compute_dtype, full_precision, upcast
 
 IMAGE_MEAN = (0.485, 0.456, 0.406)
@@ -30,7 +30,7 @@ class ClipBatch(NamedTuple):
     frame_count: Int[Array, " B"] | None = None  # real frames of each clip, its first ones, at least one; None: all
 
 
-@full_precision
+@full_precision()
 def encode(
     params: Params,
     images: Float[Array, "B S H W 3"],
@@ -58,7 +58,7 @@ def encode(
     images = as_images(images)
     patch_grid(images, config)
     check_floats(images)
-    return apply(Backbone(config, compute_dtype, remat), params["backbone"], images)
+    return Backbone(config, compute_dtype, remat).apply({"params": params["backbone"]}, images)  # type: ignore
 
 
 class Backbone(nn.Module):
@@ -78,19 +78,14 @@ class Backbone(nn.Module):
         x = (images - jnp.asarray(IMAGE_MEAN)[(None,) * 4]) / jnp.asarray(IMAGE_STD)[(None,) * 4]
         embed = Conv(C, (size, size), strides=size, padding="VALID", dtype=dtype, name="patch_embedding")
         x = upcast(embed(x.reshape(B * S, H, W, 3))).reshape(B * S, grid[0] * grid[1], C)
-        positions = self.param("position_embedding", nn.initializers.zeros, (1 + side**2, C)).astype(x.dtype)
+        positions = self.param("position_embedding", TABLE, (1 + side**2, C)).astype(x.dtype)
         x = x + patch_positions(positions[1:], side, grid)[None]
-        class_token = self.param("class_token", nn.initializers.zeros, (1, C))
-        registers = self.param("register_tokens", nn.initializers.zeros, (REGISTERS, C))
+        class_token = self.param("class_token", TABLE, (1, C))
+        registers = self.param("register_tokens", TABLE, (REGISTERS, C))
         special = jnp.concatenate([class_token + positions[:1], registers]).astype(x.dtype)  # [1 + R, C]
         x = jnp.concatenate([jnp.broadcast_to(special, (B * S, *special.shape)), x], axis=1)  # [B*S, 1 + R + P, C]
-        block = Block(config.dino_num_heads, epsilon=_EPSILON, dtype=dtype)
-        layers = stack(self, "blocks", block, config.dino_depth, x)
-
-        def step(x, layer):
-            return apply_block(block, layer, x)[0], None
-
-        x, _ = jax.lax.scan(with_remat_policy(step, remat=self.remat), x, layers)
+        block = StoredBlock(config.dino_num_heads, epsilon=_EPSILON, dtype=dtype, layer_scale=1.0, name="blocks")
+        x, _ = over_layers(BlockLayer, config.dino_depth, store=stored(remat=self.remat))(block)(x)
         x = LayerNorm(_EPSILON, name="norm")(x)
         return x[:, 1 + REGISTERS :].reshape(B, S, grid[0] * grid[1], C)
 

@@ -8,27 +8,26 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
+from vggtjax.network.kernels.attention import attention
 from vggtjax.network.kernels.cpu_attention import ATTENDED
 from vggtjax.network.kernels.pieces import map_chunks, map_chunks_in_place
 from vggtjax.network.kernels.quantised import as_multiplied
-from vggtjax.network.layers import MLP, Dense, DType, LayerNorm, Params, apply
+from vggtjax.network.layers import MLP, Dense, DType, LayerNorm, constant
 from vggtjax.network.rope import Rope, apply_rope
-from vggtjax.network.suppression import Attend, SuppressedKeys, suppressed_attention
 
 _STORED = jax.checkpoint_policies.save_from_both_policies(
     jax.checkpoint_policies.dots_with_no_batch_dims_saveable, jax.checkpoint_policies.save_only_these_names(ATTENDED)
 )
 
 
-def with_remat_policy(step: Callable, *, remat: bool) -> Callable:
-    """Return the step of a scan over blocks with little stored for its gradient.
+def stored(*, remat: bool) -> Callable[..., Any]:
+    """Return what a loop over blocks stores for its gradient, beside the input of every block.
 
-    It keeps the outputs of linear layers and of attention, as all else is cheap to compute again, or with `remat` the
-    step's input alone.
+    It is the outputs of linear layers and of attention, as all else is cheap to compute again; with `remat`, nothing.
     """
-    return jax.checkpoint(step, prevent_cse=False, policy=None if remat else _STORED)
+    return jax.checkpoint_policies.nothing_saveable if remat else _STORED
 
 
 class Projections(nn.Module):
@@ -72,37 +71,35 @@ class Block(nn.Module):
     qk_norm: bool = False
     epsilon: float = 1e-5
     dtype: DType = jnp.float32
-    attend: Attend = suppressed_attention
+    layer_scale: float = 0.01  # at the start
 
     @nn.compact
     def __call__(
         self,
         x: Float[Array, "B L C"],
         rope: Rope | None = None,
-        suppressed: SuppressedKeys | None = None,
-        is_real: Bool[Array, "B L"] | None = None,
+        attend: Callable[[Array, Array, Array], Array] = attention,
     ) -> tuple[Float[Array, "B L C"], Float[Array, "B L N D"], Float[Array, "B L N D"]]:
         """Return the tokens after the block, and q and k after norm and rotation, for the motion cues.
 
         Args:
             x: B sequences of L tokens.
             rope: the angles of T tokens, where L is a multiple of T; or None.
-            suppressed: the keys to suppress, or None.
-            is_real: tokens that others attend to; None for all.
+            attend: attention of each sequence, from q, k and v to what is projected.
         """
         B, L, C = x.shape
-        attention = Projections(self.num_heads, C, self.qk_norm, self.dtype, name="attention")
+        projections = Projections(self.num_heads, C, self.qk_norm, self.dtype, name="attention")
         norm1, norm2 = (LayerNorm(self.epsilon, dtype=self.dtype, name=name) for name in ("norm1", "norm2"))
-        scale1, scale2 = (self.param(name, nn.initializers.ones, (C,)) for name in ("scale1", "scale2"))
+        scale1, scale2 = (self.param(name, constant(self.layer_scale), (C,)) for name in ("scale1", "scale2"))
         mlp = MLP(4 * C, C, self.dtype, name="mlp")
 
         def before(rows, count):
             x, place = rows
             angles = None if rope is None else Rope(rope.cos[place], rope.sin[place])
-            return attention.heads(norm1(x), angles, count)
+            return projections.heads(norm1(x), angles, count)
 
         def after(x, y):
-            x = add(x, scale1, attention.project(y))
+            x = add(x, scale1, projections.project(y))
             return add(x, scale2, mlp(norm2(x)))
 
         def add(x, scale, y):
@@ -111,12 +108,20 @@ class Block(nn.Module):
         tokens = x.reshape(B * L, C)
         place = jnp.arange(B * L) % (L if rope is None else rope.cos.shape[0])
         q, k, v = (y.reshape(B, L, *y.shape[1:]) for y in map_chunks(before, (tokens, place)))
-        y = self.attend(q, k, v, suppressed, is_real).reshape(B * L, C)
+        y = attend(q, k, v).reshape(B * L, C)
         return map_chunks_in_place(after, tokens, y).reshape(B, L, C), q, k
 
 
-def apply_block(
-    block: Block, params: Params, x: Float[Array, "B L C"], *inputs: Any, **options: Any
-) -> tuple[Array, Array, Array]:
-    """Run a block with one layer of a stack of parameters, whose kernels may be in another form."""
-    return apply(block, as_multiplied(params), x, *inputs, **options)
+# A block whose kernels may be stored in another form, as in 8 bits: one layer at a time is turned back.
+StoredBlock: Any = nn.map_variables(Block, "params", as_multiplied, init=True)
+
+
+class BlockLayer(nn.Module):
+    """A block as the body of a loop over layers."""
+
+    block: Block
+    attend: Callable[[Array, Array, Array], Array] = attention
+
+    def __call__(self, x: Float[Array, "B L C"], _: None = None) -> tuple[Float[Array, "B L C"], None]:
+        """Return the tokens after the block."""
+        return self.block(x, attend=self.attend)[0], None

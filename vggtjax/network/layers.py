@@ -1,4 +1,4 @@
-"""The leaves of the network as linen modules, and stacks of equal layers."""
+"""The leaves of the network as linen modules, loops over equal layers, and how parameters start."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import linen as nn
+from flax import struct
+from flax.core.meta import AxisMetadata
 from flax.linen.dtypes import promote_dtype
 from jaxtyping import Array, Float
 
@@ -18,19 +21,62 @@ from vggtjax.network.precision import upcast
 Params = dict[str, Any]
 DType = Any
 _State = TypeVar("_State")
+Mean = float | tuple[float, ...]  # of all numbers of a parameter, or of each output channel
+
+
+class Start(struct.PyTreeNode, AxisMetadata[Any]):
+    """A declared parameter, and how `init_params` draws it: normally distributed, or constant where the spread is 0."""
+
+    value: Any
+    mean: Mean = struct.field(pytree_node=False)
+    spread: float = struct.field(pytree_node=False)
+
+    def unbox(self) -> Any:
+        """Return the parameter."""
+        return self.value
+
+    def replace_boxed(self, val: Any) -> Start:
+        """Return the same start of another parameter."""
+        return self.replace(value=val)
+
+    def add_axis(self, index: int, params: dict[Any, Any]) -> Start:
+        """Return the same start for a stack of layers."""
+        return self
+
+    remove_axis = add_axis
+
+
+def constant(mean: Mean) -> nn.initializers.Initializer:
+    """Return an initialiser of a parameter that starts at one value, or at one of every channel."""
+    return lambda key, shape, dtype=jnp.float32: Start(jnp.zeros(shape, dtype), mean, 0.0)
+
+
+def normal(spread: float) -> nn.initializers.Initializer:
+    """Return an initialiser of a parameter that starts with a normal distribution around 0."""
+    return lambda key, shape, dtype=jnp.float32: Start(jnp.zeros(shape, dtype), 0.0, spread)
+
+
+def by_fan_in(gain: float = 1.0) -> nn.initializers.Initializer:
+    """Return an initialiser of a kernel whose outputs have the variance of its inputs, times the squared gain."""
+    return lambda key, shape, dtype=jnp.float32: normal(gain * np.prod(shape[:-1]) ** -0.5)(key, shape, dtype)
+
+
+ZEROS, ONES, TABLE = constant(0.0), constant(1.0), normal(0.02)
 
 
 class Dense(nn.Module):
-    """A linear layer, whose kernel `init_params` draws. Products in bfloat16 have outputs in float32."""
+    """A linear layer. Products in bfloat16 have outputs in float32."""
 
     features: int
     dtype: DType = None  # of the product; None: the wider type of inputs and parameters
     activate: bool = False  # by GELU: exact, or its tanh form for bfloat16 on an accelerator
+    gain: float = 1.0  # of the kernel's start
+    bias_start: Mean = 0.0
 
     @nn.compact
     def __call__(self, x: Float[Array, "... I"]) -> Float[Array, "... F"]:
-        kernel = self.param("kernel", nn.initializers.zeros, (x.shape[-1], self.features), jnp.float32)
-        bias = self.param("bias", nn.initializers.zeros, (self.features,), jnp.float32)
+        kernel = self.param("kernel", by_fan_in(self.gain), (x.shape[-1], self.features), jnp.float32)
+        bias = self.param("bias", constant(self.bias_start), (self.features,), jnp.float32)
         x, kernel, bias = promote_dtype(x, kernel, bias, dtype=self.dtype)
         bias = bias.reshape((1,) * (x.ndim - 1) + (-1,))
         exact, fused = (gelu, _fused_gelu) if self.activate else (_unchanged, _unchanged)
@@ -49,9 +95,10 @@ class Dense(nn.Module):
 
 
 class Conv(nn.Conv):
-    """A convolution, whose kernel `init_params` draws."""
+    """A convolution."""
 
-    kernel_init: Any = nn.initializers.zeros
+    kernel_init: Any = by_fan_in()
+    bias_init: Any = ZEROS
 
 
 class Conv3x3(Conv):
@@ -66,6 +113,8 @@ class LayerNorm(nn.LayerNorm):
 
     epsilon: float = 1e-5
     use_fast_variance: bool = False
+    scale_init: Any = ONES
+    bias_init: Any = ZEROS
 
 
 class MLP(nn.Module):
@@ -74,11 +123,13 @@ class MLP(nn.Module):
     hidden: int
     features: int
     dtype: DType = None  # as of `Dense`
+    gain: float = 1.0  # of the last kernel's start
+    bias_start: Mean = 0.0  # of the last bias
 
     @nn.compact
     def __call__(self, x: Float[Array, "... C"]) -> Float[Array, "... F"]:
         x = Dense(self.hidden, dtype=self.dtype, activate=True, name="fc1")(x)
-        return Dense(self.features, dtype=self.dtype, name="fc2")(x)
+        return Dense(self.features, dtype=self.dtype, gain=self.gain, bias_start=self.bias_start, name="fc2")(x)
 
 
 @jax.custom_vjp
@@ -113,27 +164,18 @@ def _unchanged(x: Array) -> Array:
     return x
 
 
-def apply(module: nn.Module, params: Params, *inputs: Any, **options: Any) -> Any:
-    """Run a module with the given parameters."""
-    return module.apply({"params": params}, *inputs, **options)
+def over_layers(layer: type[nn.Module], depth: int, *, store: Any = None) -> Any:
+    """Return a module that runs `depth` equal layers, (carry, inputs) -> (carry, None), in a loop.
 
-
-def stack(parent: nn.Module, name: str, layer: nn.Module, depth: int, *inputs: Any) -> Params:
-    """Return the parameters of `depth` equal layers, stacked on axis 0: a parameter of `parent`, which may scan them.
-
-    `inputs` are those of one layer; only their shapes are used, and only to declare the parameters.
+    Its parameters are those of one layer with an axis of layers in front, and so are its inputs. With `store` it is a
+    policy of `jax.checkpoint`: what is stored for the gradient.
     """
-    if not parent.is_initializing():
-        return dict(parent.get_variable("params", name))
-
-    def declare(key: Array) -> Params:
-        shapes = jax.eval_shape(layer.init, key, *inputs)["params"]
-        return jax.tree.map(lambda leaf: jnp.zeros((depth, *leaf.shape), leaf.dtype), shapes)
-
-    return parent.param(name, declare)
+    step: Any = layer if store is None else nn.remat(layer, prevent_cse=False, policy=store)
+    loop = {"variable_axes": {"params": 0}, "split_rngs": {"params": True}, "length": depth}
+    return nn.scan(step, **loop, check_constancy_invariants=False)  # the check would trace each layer twice
 
 
-def iterate(parent: nn.Module, step: Callable[[_State], _State], start: _State, count: int) -> _State:
+def repeated(parent: nn.Module, step: Callable[[_State], _State], start: _State, count: int) -> _State:
     """Return `step` applied `count` times: a loop of jax, or a single step while `parent` declares its parameters."""
     if parent.is_initializing():
         return step(start)

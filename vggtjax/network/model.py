@@ -11,18 +11,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
+from flax.core.meta import unbox
 from jaxtyping import Array, Bool, Float, Int
 
 from vggtjax.config import Suppress, VGGTConfig
 from vggtjax.errors import InputError
-from vggtjax.network.aggregator import SPECIAL_TOKENS, Accumulator, Aggregator, aggregate, identity
+from vggtjax.network.aggregator import SPECIAL_TOKENS, Accumulator, Aggregator, identity
 from vggtjax.network.backbone import Backbone, ClipBatch, encode, patch_grid
 from vggtjax.network.given import as_array, as_images, check_floats
-from vggtjax.network.heads.camera_head import ITERATIONS, CameraHead, predict_pose
+from vggtjax.network.heads.camera_head import CameraHead, predict_pose
 from vggtjax.network.heads.dpt_head import DENSE_HEADS, DenseHead, predict_dense, project_tap
 from vggtjax.network.heads.track_head import TrackHead, check_track_size, predict_tracks, smallest_side
 from vggtjax.network.kernels.frames import Frames
-from vggtjax.network.layers import Params
+from vggtjax.network.layers import Params, Start
 from vggtjax.network.precision import Compute, full_precision
 from vggtjax.network.suppression import Suppression
 
@@ -119,7 +120,7 @@ def forward(
     return predict(params, clips, config, **options, suppression=suppression, compute=compute)
 
 
-@full_precision
+@full_precision()
 def predict(
     params: Params,
     clips: ClipBatch,
@@ -153,12 +154,11 @@ def predict(
 
         return projected
 
-    camera_tokens, taps, sums = aggregate(
-        params,
+    camera_tokens, taps, sums = Aggregator(config).apply(  # type: ignore[misc]
+        {"params": params["aggregator"]},
         patch_tokens,
-        config,
         grid,
-        captures=[capture(slot) for slot in range(len(config.taps))],
+        [capture(slot) for slot in range(len(config.taps))],
         accumulator=accumulator,
         frame_count=clips.frame_count,
         suppression=suppression,
@@ -192,11 +192,12 @@ def predict(
 
 def parameter_shapes(config: VGGTConfig) -> Params:
     """Return the parameter tree's shapes and dtypes (`jax.ShapeDtypeStruct` leaves) without allocating arrays."""
-    return jax.tree.map(lambda leaf: leaf, _declared(config))  # a copy of the tree: callers may change it
+    return unbox(_declared(config))  # a copy of the tree: callers may change it
 
 
 @lru_cache(maxsize=16)  # a second for each configuration; a run and its checkpoints ask for one many times
 def _declared(config: VGGTConfig) -> Params:
+    """Return the shapes in the tree of parameters, each in its `Start`."""
     side = -(-smallest_side(config) // config.patch_size)  # patches a side of an image that every head can read
     grid, size = (side, side), side * config.patch_size
 
@@ -223,38 +224,19 @@ def _declared(config: VGGTConfig) -> Params:
 def init_params(seed: int, config: VGGTConfig) -> Params:
     """Return random parameters to start training from: nested dicts with Flax names, layers stacked on axis 0.
 
-    Values are drawn on the host, which takes a second; compiling jax's generator for every shape takes a minute.
-    Kernels have variance 1 / fan-in, tables 0.02^2; LayerScale starts as in VGGT (1 in the backbone, 0.01 elsewhere),
-    the camera head near no motion and a field of view of 1 rad, the dense heads near depth 1 and confidence 2, the
-    track head near no motion.
+    Every layer says how its parameters start: kernels with variance 1 / fan-in, tables with 0.02^2; LayerScale as in
+    VGGT (1 in the backbone, 0.01 elsewhere), the camera head near no motion and a field of view of 1 rad, the dense
+    heads near depth 1 and confidence 2, the track head near no motion. Values are drawn on the host, which takes a
+    second; compiling jax's generator for every shape takes a minute.
     """
     generator = np.random.default_rng(seed)
 
-    def draw(path: tuple, leaf: jax.ShapeDtypeStruct) -> Array:
-        names = [entry.key for entry in path]
-        if names[-1] in ("bias", "empty_pose"):
-            values = np.zeros(leaf.shape)
-        elif names[-1] == "scale":
-            values = np.ones(leaf.shape)
-        elif names[-1] in ("scale1", "scale2"):
-            values = np.full(leaf.shape, 1.0 if names[0] == "backbone" else 0.01)
-        else:
-            stacked = any(name.endswith("blocks") or name == "trunk" for name in names)
-            fan_in = leaf.shape[0] if "upsample" in names[-2] else np.prod(leaf.shape[stacked:-1])
-            spread = fan_in**-0.5 if names[-1] == "kernel" else 0.02
-            values = spread * generator.standard_normal(leaf.shape, np.float32)
-        return jax.device_put(np.asarray(values, leaf.dtype))
+    def draw(start: Start) -> Array:
+        shape, dtype = start.value.shape, start.value.dtype
+        values = start.mean if start.spread == 0 else start.spread * generator.standard_normal(shape, np.float32)
+        return jax.device_put(np.broadcast_to(np.asarray(values, dtype), shape))
 
-    params = jax.tree_util.tree_map_with_path(draw, parameter_shapes(config))
-    if "camera" in config.heads:
-        start = np.array([0, 0, 0, 0, 0, 0, 1, 1, 1]) / ITERATIONS  # every iteration adds it
-        pose = params["camera_head"]["pose_branch"]["fc2"]
-        pose |= {"kernel": 0.1 * pose["kernel"], "bias": jnp.asarray(start, jnp.float32)}
-    for name in DENSE_HEADS.keys() & set(config.heads):  # exp of full-size inputs would overflow
-        params[HEADS[name]]["regression"]["conv2"]["kernel"] *= 0.01
-    if "tracks" in config.heads:
-        params["track_head"]["flow_projection"]["kernel"] *= 0.01  # tracks start without motion
-    return params
+    return jax.tree.map(draw, _declared(config), is_leaf=lambda leaf: isinstance(leaf, Start))
 
 
 def _check(params: Params, grid: tuple[int, int], clips: ClipBatch, config: VGGTConfig, outputs: Sequence[str]) -> None:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
-from typing import ParamSpec, TypeVar, get_args
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
@@ -15,9 +14,6 @@ from jaxtyping import Array, Float
 from vggtjax.config import Attention, ComputeDType, Precision
 from vggtjax.errors import InputError, check_choice
 from vggtjax.network.kernels.frames import Frames
-
-_Parameters = ParamSpec("_Parameters")
-_Result = TypeVar("_Result")
 
 
 @dataclass(frozen=True)
@@ -70,16 +66,12 @@ def products(precision: str) -> AbstractContextManager[None]:
     return jax.default_matmul_precision("tensorfloat32" if precision == "tf32" else "highest")
 
 
-def full_precision(function: Callable[_Parameters, _Result]) -> Callable[_Parameters, _Result]:
-    """Trace `function` with every matrix product and convolution at the highest precision (never TF32).
+@contextmanager
+def full_precision() -> Iterator[None]:
+    """Trace with every matrix product and convolution at the highest precision (never TF32); decorates functions.
 
     Types are promoted as jax does by default, whatever the program has set: weights in bfloat16 meet float32. The
-    settings hold only while `function` is traced; nothing global changes.
+    settings hold only while a function is traced; nothing global changes.
     """
-
-    @functools.wraps(function)
-    def wrapped(*args: _Parameters.args, **kwargs: _Parameters.kwargs) -> _Result:
-        with jax.default_matmul_precision("highest"), jax.numpy_dtype_promotion("standard"):
-            return function(*args, **kwargs)
-
-    return wrapped
+    with jax.default_matmul_precision("highest"), jax.numpy_dtype_promotion("standard"):
+        yield

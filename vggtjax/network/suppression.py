@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vggtjax.config import Suppress
 from vggtjax.errors import InputError, check_choice, whole_number
+from vggtjax.network.kernels.attention import attention
 from vggtjax.network.kernels.frames import Frames
 from vggtjax.network.kernels.gathered_attention import gathered_attention
 
@@ -110,7 +111,7 @@ def suppressed_attention(
     q: Float[Array, "B T N D"],
     k: Float[Array, "B T N D"],
     v: Float[Array, "B T N D"],
-    suppressed: SuppressedKeys | None,
+    suppressed: SuppressedKeys | None = None,
     is_real: Bool[Array, "B T"] | None = None,
     frames: Frames = Frames(),
 ) -> Float[Array, "B T N D"]:
@@ -120,23 +121,20 @@ def suppressed_attention(
     (VGGT4D). The flag is a scalar per pair, so the choice is a branch, not a select. A share m scales the key by 1 - m,
     which equals "zero" for shares of 0 and 1. With `frames` on several devices, queries see the keys of all of them.
     """
-
-    def attention(q, k, v, visible):
-        return gathered_attention(q, k, v, visible, frames)
-
+    attend = attention if frames.mesh is None else partial(gathered_attention, frames=frames)
     if suppressed is None:
-        return attention(q, k, v, is_real)
+        return attend(q, k, v, is_real)
     if suppressed.are_shares:
-        return attention(q, suppressed.scaled(k), v, is_real)
+        return attend(q, suppressed.scaled(k), v, is_real)
 
     def zero(q, k, v, hidden):
-        return attention(q, jnp.where(hidden[:, :, None, None], 0, k), v, is_real)
+        return attend(q, jnp.where(hidden[:, :, None, None], 0, k), v, is_real)
 
     def drop(q, k, v, hidden):
-        return attention(q, k, v, ~hidden if is_real is None else ~hidden & is_real)
+        return attend(q, k, v, ~hidden if is_real is None else ~hidden & is_real)
 
     def plain(q, k, v, hidden):
-        return attention(q, k, v, is_real)
+        return attend(q, k, v, is_real)
 
     masked = {"zero": zero, "drop": drop}[suppressed.suppress]
     with jax.named_scope("suppress"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,12 +11,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from vggtjax.config import VGGTConfig
-from vggtjax.network.aggregator import SPECIAL_TOKENS, aggregate
+from vggtjax.network.aggregator import SPECIAL_TOKENS, Aggregator
 from vggtjax.network.backbone import encode, patch_grid
 from vggtjax.network.heads.camera_head import predict_pose
 from vggtjax.network.heads.dpt_head import DENSE_HEADS, predict_dense, project_tap
 from vggtjax.network.heads.pose import quaternion_to_matrix
-from vggtjax.network.layers import LayerNorm, Params, apply
+from vggtjax.network.layers import LayerNorm, Params
 from vggtjax.network.model import HEADS
 from vggtjax.network.precision import Compute, full_precision
 from vggtjax.storage.json_values import Natural, NotNegative, check_fields
@@ -69,7 +70,7 @@ def init_probes(seed: int, config: VGGTConfig) -> Params:
     return {name: {"kernel": jnp.zeros((taps, E, F)), "bias": jnp.zeros((taps, F))} for name, F in widths.items()}
 
 
-@full_precision
+@full_precision()
 def objective(
     trained: Params,
     batch: Batch,
@@ -114,7 +115,7 @@ def objective(
     def network(model: Params):
         tokens = encode(model, images, config, compute_dtype=compute_dtype)
         settings = {"accumulator": matching, "suppression": batch.suppression(config), "compute": compute}
-        return aggregate(model, tokens, config, grid, captures=captures, **settings)
+        return Aggregator(config).apply({"params": model["aggregator"]}, tokens, grid, captures, **settings)
 
     camera_tokens, taps, sums = (jax.checkpoint(network) if remat else network)(model)
     pose = predict_pose(model, camera_tokens, config, compute_dtype=compute_dtype)
@@ -197,7 +198,7 @@ def _depth_error(depth: Float[Array, "B S H W"], truth: Float[Array, "B S H W"])
 
 
 def _probe(params: Params, slot: int, tokens: Float[Array, "... E"]) -> Float[Array, "... F"]:
-    normed = apply(LayerNorm(use_bias=False, use_scale=False), {}, tokens)
+    normed: Any = LayerNorm(use_bias=False, use_scale=False).apply({}, tokens)
     bias = params["bias"][slot].reshape((1,) * (tokens.ndim - 1) + (-1,))
     return jnp.einsum("...e,ef->...f", normed, params["kernel"][slot]) + bias
 

@@ -51,7 +51,7 @@ class MatchCounts(NamedTuple):
     between: Float[Array, ...]  # in each other frame
 
 
-@full_precision
+@full_precision()
 def targets(clip: SyntheticClip) -> Targets:
     """Return the truth that the heads regress, normalised as in VGGT: first camera, mean point distance 1."""
     H, W = clip.depth.shape[-2:]
@@ -67,7 +67,7 @@ def targets(clip: SyntheticClip) -> Targets:
     )
 
 
-@full_precision
+@full_precision()
 def matches(clip: SyntheticClip, patch_size: int) -> Matches:
     """Return the positions of each frame's patch centres in every other frame; moving parts are followed."""
     B, S, H, W = clip.depth.shape

@@ -91,7 +91,7 @@ class _Equations(NamedTuple):
     focal_slope: Float[Array, ""]
 
 
-@full_precision
+@full_precision()
 def adjust(
     depth: Float[Array, "S P"],
     cameras: Cameras,

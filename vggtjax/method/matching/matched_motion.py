@@ -37,7 +37,7 @@ class Motion(NamedTuple):
     world: Static  # the static world that fits best
 
 
-@full_precision
+@full_precision()
 def motion(
     matches: Matches,
     saliency: Float[Array, "S P"],

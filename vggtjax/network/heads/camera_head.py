@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Array, Float, Int
 
 from vggtjax.config import VGGTConfig
-from vggtjax.network.block import Block, apply_block
+from vggtjax.network.block import BlockLayer, StoredBlock
 from vggtjax.network.heads.pose import POSE_SIZE
+from vggtjax.network.kernels.attention import attention
 from vggtjax.network.kernels.frames import Frames
-from vggtjax.network.layers import MLP, Dense, LayerNorm, Params, apply, iterate, stack
+from vggtjax.network.layers import MLP, ZEROS, Dense, LayerNorm, Params, over_layers, repeated
 from vggtjax.network.precision import full_precision
 
 ITERATIONS = 4
 
 
-@full_precision
+@full_precision()
 def predict_pose(
     params: Params,
     camera_tokens: Float[Array, "B S E"],
@@ -40,7 +43,7 @@ def predict_pose(
         frames: where the frames are; every device computes the poses of all frames, which takes little.
     """
     head = CameraHead(config, stop_gradient, compute_dtype)
-    return apply(head, params["camera_head"], camera_tokens, frame_count, frames)
+    return head.apply({"params": params["camera_head"]}, camera_tokens, frame_count, frames)  # type: ignore
 
 
 class CameraHead(nn.Module):
@@ -64,23 +67,26 @@ class CameraHead(nn.Module):
         is_real = None if is_real is None else frames.gather(is_real)
         camera_tokens = frames.gather(camera_tokens)
         E = config.tap_dim
-        block = Block(config.camera_num_heads, dtype=jnp.dtype(self.compute_dtype or camera_tokens.dtype))
         tokens = LayerNorm(name="token_norm")(camera_tokens)
         normed = LayerNorm(1e-6, use_bias=False, use_scale=False)(tokens)
-        empty = self.param("empty_pose", nn.initializers.zeros, (1, 1, POSE_SIZE))
+        empty = self.param("empty_pose", ZEROS, (1, 1, POSE_SIZE))
         empty = jnp.broadcast_to(empty, (*tokens.shape[:2], POSE_SIZE)).astype(tokens.dtype)
         embed, modulate = Dense(E, name="pose_embedding"), Dense(3 * E, name="modulation")
-        trunk, norm = stack(self, "trunk", block, config.camera_depth, tokens), LayerNorm(name="trunk_norm")
-        update = MLP(E // 2, POSE_SIZE, name="pose_branch")
+        dtype = jnp.dtype(self.compute_dtype or camera_tokens.dtype)
+        block = StoredBlock(config.camera_num_heads, dtype=dtype, name="trunk")
+        trunk = over_layers(BlockLayer, config.camera_depth)(block, partial(attention, visible=is_real))
+        norm = LayerNorm(name="trunk_norm")
+        start = tuple(number / ITERATIONS for number in (0, 0, 0, 0, 0, 0, 1, 1, 1))  # every iteration adds it
+        update = MLP(E // 2, POSE_SIZE, gain=0.1, bias_start=start, name="pose_branch")
 
         def iteration(estimates):
             pose, previous = estimates  # sum of all updates so far; input of this iteration
             shift, scale, gate = jnp.split(modulate(nn.silu(embed(previous))), 3, axis=-1)
             x = tokens + gate * (normed * (1 + scale) + shift)
-            x, _ = jax.lax.scan(lambda x, layer: (apply_block(block, layer, x, is_real=is_real)[0], None), x, trunk)
+            x, _ = trunk(x)
             pose = pose + update(norm(x))
             return (pose, jax.lax.stop_gradient(pose) if self.stop_gradient else pose)
 
-        pose, _ = iterate(self, iteration, (jnp.zeros_like(empty), empty), ITERATIONS)
+        pose, _ = repeated(self, iteration, (jnp.zeros_like(empty), empty), ITERATIONS)
         pose = frames.share(pose, S)
         return jnp.concatenate([pose[..., :7], nn.relu(pose[..., 7:])], axis=-1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,7 @@ from jaxtyping import Array, Float
 from vggtjax.config import VGGTConfig
 from vggtjax.network.heads.resize import resize_aligned
 from vggtjax.network.kernels.pieces import largest_divisor
-from vggtjax.network.layers import Conv, Conv3x3, Dense, LayerNorm, Params, apply
+from vggtjax.network.layers import ZEROS, Conv, Conv3x3, Dense, LayerNorm, Params, normal
 from vggtjax.network.precision import products, upcast
 
 
@@ -59,8 +60,8 @@ class DepthToSpace(nn.Module):
     def __call__(self, x: Float[Array, "F h w C"]) -> Float[Array, "F H W C"]:
         F, h, w, C = x.shape
         s = self.factor
-        kernel = self.param("kernel", nn.initializers.zeros, (C, s, s, C))
-        bias = self.param("bias", nn.initializers.zeros, (C,))
+        kernel = self.param("kernel", normal(C**-0.5), (C, s, s, C))
+        bias = self.param("bias", ZEROS, (C,))
         x = jnp.einsum("fhwc,cabo->fhawbo", x, kernel.astype(x.dtype)).reshape(F, h * s, w * s, C)
         return x + bias.astype(x.dtype)[None, None, None]
 
@@ -124,7 +125,7 @@ class Regression(nn.Module):
     @nn.compact
     def __call__(self, x: Float[Array, "F H W C"]) -> Float[Array, "F H W O"]:
         x = nn.relu(Conv3x3(HIDDEN, name="conv1")(x))
-        return Dense(self.channels, name="conv2")(x)
+        return Dense(self.channels, gain=0.01, name="conv2")(x)  # exp of full-size inputs would overflow
 
 
 class TapHead(nn.Module):
@@ -178,7 +179,7 @@ def project_tap(
 ) -> Float[Array, "... F"]:
     """Return a head's projection of the tap in `slot`; nothing else of the tap needs to be stored."""
     with products(precision):
-        return apply(TapHead(config), params, tokens, slot, method="project")
+        return TapHead(config).apply({"params": params}, tokens, slot, method="project")  # type: ignore
 
 
 def predict_dense(
@@ -200,7 +201,7 @@ def predict_dense(
         precision: as in `Compute`.
     """
     with products(precision):
-        out = apply(DenseHead(config, kind), params, taps, grid)
+        out: Any = DenseHead(config, kind).apply({"params": params}, taps, grid)
     values, confidence = out[..., :-1], 1 + jnp.exp(out[..., -1])
     return DENSE_HEADS[kind].activate(values), confidence
 

@@ -17,7 +17,7 @@ from vggtjax.network.heads.dpt_head import DPTFeatures, TapHead, add_positions, 
 from vggtjax.network.heads.resize import resize_aligned
 from vggtjax.network.heads.sampling import bilinear, neighbours
 from vggtjax.network.kernels.attention import attention as attention_of
-from vggtjax.network.layers import MLP, Dense, LayerNorm, Params, apply, iterate, stack
+from vggtjax.network.layers import MLP, TABLE, ZEROS, Dense, LayerNorm, Params, by_fan_in, over_layers, repeated
 from vggtjax.network.precision import full_precision
 
 LAYERS = 6
@@ -26,7 +26,6 @@ HEADS = 8
 ITERATIONS = 4
 STRIDE = 2  # pixels of the image to one of the feature maps
 FLOW_SCALE = 518.0  # pixels of the feature maps: the unit of flows in the published weights
-_BLOCKS = {"time": False, "virtual_to_point": True, "virtual": False, "point_to_virtual": True}  # has context
 FLOATS_AT_ONCE = 1 << 24  # in feature windows; bounds the memory of the correlations
 
 
@@ -38,7 +37,7 @@ class Tracks(NamedTuple):
     confidence: Float[Array, "B S Q"]  # probability that the position is close to the truth
 
 
-@full_precision
+@full_precision()
 def predict_tracks(
     params: Params,
     taps: list[Float[Array, "B S P F"]],
@@ -59,7 +58,7 @@ def predict_tracks(
         config: the model's configuration.
         grid: rows and columns of patches.
     """
-    return apply(TrackHead(config), params, taps, query_points, grid)
+    return TrackHead(config).apply({"params": params}, taps, query_points, grid)  # type: ignore
 
 
 def smallest_side(config: VGGTConfig) -> int:
@@ -98,9 +97,7 @@ class TrackHead(TapHead):
         pyramid = _pyramid(maps, config.track_corr_levels, config.track_corr_radius)
         place = _position_embedding(inside, size, 3 * F + 4)[:, :, None]  # [B, Q, 1, E]
         later = np.arange(S) > 0
-        kind = self.param("query_token", nn.initializers.zeros, (2, 3 * F + 4))[later.astype(np.int32)][
-            None, None
-        ]  # [1, 1, S, E]
+        kind = self.param("query_token", TABLE, (2, 3 * F + 4))[later.astype(np.int32)][None, None]  # [1, 1, S, E]
         start = jnp.broadcast_to(query[:, None], (B, S, *query.shape[1:]))
         compare, transform = MLP(C, F, name="correlation_mlp"), self._transformer()
         feature_norm, feature_update = LayerNorm(name="feature_norm"), Dense(F, name="feature_update")
@@ -121,7 +118,7 @@ class TrackHead(TapHead):
             positions = jnp.where(jnp.asarray(later)[None, :, None, None], positions + delta[..., :2], start)
             return positions, features + update
 
-        positions, features = iterate(self, iteration, (start, features), ITERATIONS)
+        positions, features = repeated(self, iteration, (start, features), ITERATIONS)
         visibility, confidence = (jax.nn.sigmoid(score(features)[..., 0]) for score in scores)
         return Tracks(positions * STRIDE, visibility, confidence)
 
@@ -148,31 +145,36 @@ class TrackHead(TapHead):
         tracks attend to them.
         """
         C, F = self.config.track_hidden, self.config.track_features
-        block, example = TrackBlock(), jnp.zeros((1, 1, 1, C))
-        layers = {
-            name: stack(self, f"{name}_blocks", block, LAYERS, example, *(example,) * has_context)
-            for name, has_context in _BLOCKS.items()
-        }
-        virtual_tracks = self.param("virtual_tracks", nn.initializers.zeros, (VIRTUAL_TRACKS, C))
+        names = ("time", "virtual_to_point", "virtual", "point_to_virtual")
+        layers = over_layers(TrackLayer, LAYERS)(*(TrackBlock(name=f"{name}_blocks") for name in names))
+        virtual_tracks = self.param("virtual_tracks", TABLE, (VIRTUAL_TRACKS, C))
         input_norm, input_projection = LayerNorm(name="input_norm"), Dense(C, name="input_projection")
-        output_norm, flow_projection = LayerNorm(name="output_norm"), Dense(F + 2, name="flow_projection")
+        output_norm, flow_projection = LayerNorm(name="output_norm"), Dense(F + 2, gain=0.01, name="flow_projection")
 
         def transform(x: Float[Array, "B Q S E"]) -> Float[Array, "B Q S O"]:
             start = input_projection(input_norm(x))
             virtual = jnp.broadcast_to(virtual_tracks[None, :, None], (x.shape[0], VIRTUAL_TRACKS, x.shape[2], C))
-            tokens, _ = jax.lax.scan(layer, jnp.concatenate([start, virtual], axis=1), layers)
+            tokens, _ = layers(jnp.concatenate([start, virtual], axis=1))
             return flow_projection(output_norm(tokens[:, : x.shape[1]] + start))
 
-        def layer(tokens: Float[Array, "B N S C"], blocks: dict[str, Params]):
-            tokens = apply(block, blocks["time"], tokens)
-            tokens = tokens.swapaxes(1, 2)  # [B, S, N, C]
-            points, virtual = tokens[:, :, :-VIRTUAL_TRACKS], tokens[:, :, -VIRTUAL_TRACKS:]
-            virtual = apply(block, blocks["virtual_to_point"], virtual, points)
-            virtual = apply(block, blocks["virtual"], virtual)
-            points = apply(block, blocks["point_to_virtual"], points, virtual)
-            return jnp.concatenate([points, virtual], axis=2).swapaxes(1, 2), None
-
         return transform
+
+
+class TrackLayer(nn.Module):
+    """A layer of the transformer as the body of a loop: over time, then over tracks."""
+
+    time: TrackBlock
+    virtual_to_point: TrackBlock
+    virtual: TrackBlock
+    point_to_virtual: TrackBlock
+
+    def __call__(self, tokens: Float[Array, "B N S C"], _: None = None) -> tuple[Float[Array, "B N S C"], None]:
+        """Return the tokens after the layer."""
+        tokens = self.time(tokens).swapaxes(1, 2)  # [B, S, N, C]
+        points, virtual = tokens[:, :, :-VIRTUAL_TRACKS], tokens[:, :, -VIRTUAL_TRACKS:]
+        virtual = self.virtual(self.virtual_to_point(virtual, points))
+        points = self.point_to_virtual(points, virtual)
+        return jnp.concatenate([points, virtual], axis=2).swapaxes(1, 2), None
 
 
 class TrackBlock(nn.Module):
@@ -219,8 +221,8 @@ class SplitDense(nn.Module):
     @nn.compact
     def __call__(self, parts: list[Float[Array, "... C"]]) -> list[Float[Array, "... C"]]:
         count = len(parts)
-        kernel = self.param("kernel", nn.initializers.zeros, (parts[0].shape[-1], count * self.channels))
-        bias = self.param("bias", nn.initializers.zeros, (count * self.channels,))
+        kernel = self.param("kernel", by_fan_in(), (parts[0].shape[-1], count * self.channels))
+        bias = self.param("bias", ZEROS, (count * self.channels,))
         pieces = zip(parts, jnp.split(kernel, count, axis=1), jnp.split(bias, count), strict=True)
         return [part @ kernel + bias[None, None, None] for part, kernel, bias in pieces]
 

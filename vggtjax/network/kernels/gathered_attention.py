@@ -25,8 +25,6 @@ def gathered_attention(
     Heads are independent: where all keys do not fit, those of a few heads are gathered, used and dropped, and gathered
     again for the gradient.
     """
-    if frames.mesh is None:
-        return attention(q, k, v, visible)
     visible = None if visible is None else frames.gather(visible)
 
     def some_heads(q, k, v):

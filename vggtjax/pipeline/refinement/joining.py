@@ -87,13 +87,13 @@ def _surface(result: Result, frame: int) -> Surface:
 
 
 @partial(jax.jit, static_argnames="step")
-@full_precision
+@full_precision()
 def _look_around(own: Surface, others: Surface, step: int) -> Seen:
     return jax.lax.map(lambda other: _look(own, other, step), others)
 
 
 @jax.jit
-@full_precision
+@full_precision()
 def _joined(own: Surface, others: Surface, tolerance: Float[Array, ""]) -> tuple[Array, Array]:
     def add(sums: tuple[Array, Array], other: Surface) -> tuple[tuple[Array, Array], None]:
         seen = _look(own, other)

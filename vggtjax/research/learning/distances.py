@@ -21,7 +21,7 @@ class PoseError(NamedTuple):
     translation: Float[Array, ""]  # RMSE of the centres over the root mean square of the true ones, after one scale
 
 
-@full_precision
+@full_precision()
 def pose_error(found: Float[Array, "S 3 4"], truth: Float[Array, "S 3 4"]) -> PoseError:
     """Return the errors of cameras (camera_from_world), each relative to the first frame; at least two frames.
 
@@ -44,7 +44,7 @@ def point_cloud_distance(found: Float[Array, "N 3"], truth: Float[Array, "M 3"])
     return sum((nearest_distance(points, others).mean() for points, others in ways), jnp.zeros(())) / 2
 
 
-@full_precision
+@full_precision()
 def nearest_distance(points: Float[Array, "N 3"], others: Float[Array, "M 3"]) -> Float[Array, " N"]:
     """Return every point's distance to the nearest of the others, differentiable by both clouds.
 

@@ -112,7 +112,7 @@ def unit_factor(
     return ratio[order][jnp.searchsorted(below, below[-1] / 2)]
 
 
-@full_precision
+@full_precision()
 def photometric_loss(fused: Fused, view: View, step: int = 1) -> Float[Array, ""]:
     """Return the difference of pictures after reprojection by the fused depth.
 
@@ -133,7 +133,7 @@ def photometric_loss(fused: Fused, view: View, step: int = 1) -> Float[Array, ""
     return _over_pairs(pair, fused, view, step)
 
 
-@full_precision
+@full_precision()
 def geometric_loss(fused: Fused, view: View, step: int = 1) -> Float[Array, ""]:
     """Return the negative log likelihood of the depths of frames given each other, for fits without any truth.
 

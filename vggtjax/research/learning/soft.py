@@ -31,7 +31,7 @@ class SoftReconstruction(NamedTuple):
     passes: Passes
 
 
-@full_precision
+@full_precision()
 def reconstruct_soft(
     params: Params,
     images: Float[Array, "B S H W 3"],

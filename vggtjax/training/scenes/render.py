@@ -42,7 +42,7 @@ class Surface(NamedTuple):
     colour: Float[Array, "3 P"]
 
 
-@full_precision
+@full_precision()
 def generate(key: Array, textures: Textures, config: SceneConfig) -> SyntheticClip:
     """Return the clip of a key. Pure: jit with `config` static, vmap over keys.
 
@@ -52,7 +52,7 @@ def generate(key: Array, textures: Textures, config: SceneConfig) -> SyntheticCl
     return render(sample_scene(scene_key, textures.tiles, config), noise_key, textures, config)
 
 
-@full_precision
+@full_precision()
 def render(scene: Scene, noise_key: Array, textures: Textures, config: SceneConfig) -> SyntheticClip:
     """Return the clip of a scene, with noise of a key. Pure: jit with `config` static."""
     step = 1 / max(config.frames - 1, 1)
@@ -68,7 +68,7 @@ def intrinsics_of(scene: Scene, config: SceneConfig) -> Float[Array, "3 3"]:
     return jnp.array([[focal, 0, config.width / 2], [0, focal, config.height / 2], [0, 0, 1]])
 
 
-@full_precision
+@full_precision()
 def cast(
     scene: Scene, textures: Textures, config: SceneConfig, time: Float[Array, ""], pixels: Float[Array, "P 2"]
 ) -> Surface:
