@@ -15,9 +15,9 @@ import jax.numpy as jnp
 from benchmarks.suite import work
 from benchmarks.suite.cases import Case
 from benchmarks.suite.measure import Measured, measure_program, timed
+from tests.shared.aggregation import aggregate
 from vggtjax.errors import InputError
 from vggtjax.method.cues import GramCues
-from vggtjax.network.aggregator import aggregate
 from vggtjax.network.backbone import encode
 from vggtjax.network.heads.dpt_head import predict_dense, project_tap
 from vggtjax.network.model import forward

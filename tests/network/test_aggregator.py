@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from tests.shared import reference
+from tests.shared.aggregation import aggregate
 from vggtjax import VGGTConfig
 from vggtjax.config import Suppress
-from vggtjax.network.aggregator import aggregate, identity
+from vggtjax.network.aggregator import identity
 from vggtjax.network.model import parameter_shapes
 from vggtjax.network.suppression import Suppression
 

@@ -63,7 +63,7 @@ def test_the_program_of_an_accelerator_gives_the_same(monkeypatch, params, confi
     wanted = _forward(params, images, **given)
     monkeypatch.setattr(jax.lax, "platform_dependent", lambda *inputs, default, **_: default(*inputs))
     monkeypatch.setattr("vggtjax.network.kernels.pieces._rows_on_cpu", lambda rows: 1)
-    monkeypatch.setattr("vggtjax.network.aggregator._CAPTURED_ROWS", 44)
+    monkeypatch.setattr("vggtjax.network.kernels.captured.ROWS_AT_ONCE", 44)
     made = forward(params, images, **given)
     for name in ("pose_encoding", "depth", "depth_confidence"):
         assert close(getattr(made, name), getattr(wanted, name)), name

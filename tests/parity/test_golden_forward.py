@@ -9,9 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.shared.aggregation import aggregate
 from tests.shared.golden import FORWARD, OUTPUTS, TOLERANCE, GoldenPass, spread_error
 from vggtjax import decode_pose, encode, forward
-from vggtjax.network.aggregator import aggregate, identity
+from vggtjax.network.aggregator import identity
 from vggtjax.network.heads.pose import encode_pose
 
 golden_pass = functools.cache(GoldenPass)

@@ -11,11 +11,11 @@ import pytest
 from jax import export
 from jax._src.cudnn import fused_attention_stablehlo as cudnn
 
+from tests.shared.aggregation import aggregate
 from tests.shared.tiny import tiny_config
 from vggtjax.method.algorithm import Clips, run_method, run_passes
 from vggtjax.method.fusion.family import PARTS, start
 from vggtjax.method.mask_refinement import cluster_losses, cluster_points
-from vggtjax.network.aggregator import aggregate
 from vggtjax.network.heads.dpt_head import predict_dense
 from vggtjax.network.kernels import attention
 from vggtjax.network.model import forward, parameter_shapes

@@ -8,9 +8,8 @@ import pytest
 from tests.shared.scored_room import room_and_truth
 from tests.shared.tiny import tiny_model
 from vggtjax import load_clip
-from vggtjax.options import METHODS, Options
-from vggtjax.pipeline.run import reconstruct, with_own_mask
-from vggtjax.pipeline.running import Running
+from vggtjax.options import METHODS
+from vggtjax.pipeline.run import reconstruct
 from vggtjax.pipeline.several import reconstruct_methods
 from vggtjax.progress import StageSeconds
 from vggtjax.research.evaluation.protocol import score
@@ -38,7 +37,7 @@ def test_a_result_of_one_pass_has_no_mask_and_the_same_depth_and_cameras(model, 
     alone = reconstruct(model, clip, method="vggt", size=42, on_stage=stages.stage)
     assert "first pass" in stages.seconds
     assert "dynamic mask" not in stages.seconds
-    used = with_own_mask(model, clip, Options("vggt"), Running(), size=42)
+    used = reconstruct(model, clip, method="vggt", keep_mask=True, size=42)
     both = reconstruct_methods(model, clip, ["vggt", "4dvggt-d"], size=42)
     assert used.dynamic_mask.any()
     for result in (alone, both["vggt"]):

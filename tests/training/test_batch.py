@@ -10,9 +10,10 @@ import pytest
 from scipy import ndimage
 from skimage.measure import label
 
+from tests.shared.aggregation import aggregate
 from tests.shared.generated import QUICK, textures
 from tests.shared.training_runs import CONFIG
-from vggtjax.network.aggregator import aggregate, identity
+from vggtjax.network.aggregator import identity
 from vggtjax.network.backbone import encode, patch_grid
 from vggtjax.network.heads.camera_head import predict_pose
 from vggtjax.network.model import init_params

@@ -53,6 +53,7 @@ _LESS_MEMORY = (
 )
 
 
+@own_settings()
 def reconstruct(
     model: Model,
     clip: Clip | ClipSource,
@@ -96,42 +97,30 @@ def reconstruct(
     """
     check_kinds(model=model, options=options, running=running, tracks=tracks, known=known)
     options, running = changed(options, running, changes)
-    given = {"size": size, "masks": masks, "tracks": tracks, "fusion": fusion, "known": known}
-    mines = options.row.makes_mask or agrees_with_pixels(options) or running.keep_passes
-    return without_mask(with_own_mask(model, clip, options, running, mines=mines, **given))
-
-
-@own_settings()
-def with_own_mask(
-    model: Model,
-    clip: Clip | ClipSource,
-    options: Options,
-    running: Running,
-    *,
-    size: int | None = None,
-    masks: GivenMasks | None = None,
-    tracks: Queries | None = None,
-    fusion: FusionRule | None = None,
-    known: KnownGeometry | None = None,
-    mines: bool = True,
-) -> Reconstruction:
-    """Return what `reconstruct` does, with the mask that the steps used, also by a method that makes none.
-
-    Unless it `mines`, nothing moves where no masks are given.
-    """
     if masks is not None:
         options.check_given_masks()
     options = options.resolved(model.config.motion)
     _check(options, running, tracks, fusion, known)
     inputs = read_inputs(model, clip, size=size, masks=masks, tracks=tracks, known=known, on_stage=running.stage)
-    outputs = _run(model, inputs, options, running, fusion, mines=mines)
+
+    run = partial(run_method, **_arguments(model, inputs, options, running, fusion))
+    with device_memory_errors(_LESS_MEMORY, *inputs.clip.images.shape[:3]):
+        started = time.perf_counter()
+        with running.stage("compile programs") as progress:
+            compiler = Compile()
+            run(step=compiler)
+            compiler.wait(progress)
+        hint_compilation_cache(time.perf_counter() - started)
+        outputs = _on_host(run(step=Execute(running.stage)), len(inputs.clip.images))
+        del run  # with its arrays on the devices
+
     result = _result(model, inputs, options, running, fusion, outputs)
     warn_of_not_finite(result)
     result, unit = _with_geometry(result, inputs, options, running.stage)
     if options.refine_mask and result.has_mask:
         with running.stage("refine mask") as progress:
             result = refined(result, progress, unit)
-    return result
+    return result if running.keep_mask else without_mask(result)
 
 
 @own_settings()
@@ -215,48 +204,42 @@ def _check(
     check_refinement(options.refine_cameras, poses_are_known)
 
 
-def _run(
-    model: Model, inputs: Inputs, options: Options, running: Running, fusion: FusionRule | None, *, mines: bool
-) -> tuple[Assembly, Passes]:
-    """Compile the method for the clip and run it; return its outputs on the host, without padded frames."""
-    clip, tracks, masks = inputs.clip, inputs.tracks, inputs.masks
-    frames, height, width = clip.images.shape[:3]
-    mesh = frames_mesh(running.devices)
+def _arguments(
+    model: Model, inputs: Inputs, options: Options, running: Running, fusion: FusionRule | None
+) -> dict[str, Any]:
+    """Return the arguments of `run_method` for a clip, on the devices that compute them."""
+    clip, tracks, masks, mesh = inputs.clip, inputs.tracks, inputs.masks, frames_mesh(running.devices)
     is_padded = running.pad_frames and tracks is None
+    frames = len(clip.images)
     length = padded_frames(frames, model.config.motion.offsets) if is_padded else frames
     padding = shared_length(length, mesh) - frames
 
     def padded(x: np.ndarray) -> Array:
         return shard_frames(np.pad(x, ((0, padding), *((0, 0),) * (x.ndim - 1)))[None], mesh)
 
-    clips = Clips(
-        images=padded(clip.images),
-        query_points={} if tracks is None else replicate(_points_by_frame(tracks), mesh),
-        frames=frames,
-    )
     params, rule = model.params, as_tree(fusion)
     if mesh is not None:
         params, rule = replicate((params, rule), mesh)
-    run = partial(
-        run_method,
-        params,
-        clips,
-        model.config,
-        options,
-        masks=(None if mines else False) if masks is None else padded(masks) if masks.any() else False,
-        fusion=rule,
-        both_outputs=running.keep_passes,
-        compute=compute_by(options, Frames(mesh, None if mesh is None else length)),
-    )
-    with device_memory_errors(_LESS_MEMORY, frames, height, width):
-        started = time.perf_counter()
-        with running.stage("compile programs") as progress:
-            compiler = Compile()
-            run(step=compiler)
-            compiler.wait(progress)
-        hint_compilation_cache(time.perf_counter() - started)
-        assembly, passes = run(step=Execute(running.stage))
-    outputs = (assembly, passes._replace(patch_tokens=None))
+    mines = options.row.makes_mask or agrees_with_pixels(options) or running.keep_passes or running.keep_mask
+    return {
+        "params": params,
+        "clips": Clips(
+            images=padded(clip.images),
+            query_points={} if tracks is None else replicate(_points_by_frame(tracks), mesh),
+            frames=frames,
+        ),
+        "config": model.config,
+        "options": options,
+        "masks": (None if mines else False) if masks is None else padded(masks) if masks.any() else False,
+        "fusion": rule,
+        "both_outputs": running.keep_passes,
+        "compute": compute_by(options, Frames(mesh, None if mesh is None else length)),
+    }
+
+
+def _on_host(outputs: tuple[Assembly, Passes], frames: int) -> tuple[Assembly, Passes]:
+    """Return what the method made on the host, without padded frames and the features of the backbone."""
+    outputs = outputs[0], outputs[1]._replace(patch_tokens=None)
     return jax.tree.map(lambda x: on_host(x)[:, :frames], outputs)
 
 

@@ -20,12 +20,14 @@ class Running:
         pad_frames: pad the clip to one of a few lengths, so that clips of similar length share compiled programs. Not
             for clips with tracks.
         keep_passes: keep both passes on the result, as `.passes`.
+        keep_mask: keep the dynamic mask that the steps used on the result, also of a method that makes none.
         on_stage: called with the name of each stage, returns a context in which the stage runs; None for none.
     """
 
     devices: int = 1
     pad_frames: bool = False
     keep_passes: bool = False
+    keep_mask: bool = False
     on_stage: OnStage | None = None
 
     @property

@@ -17,7 +17,7 @@ from vggtjax.options import Options
 from vggtjax.pipeline.agreement import agree_with_pixels
 from vggtjax.pipeline.arguments import check_kinds
 from vggtjax.pipeline.fields import assembled_fields
-from vggtjax.pipeline.run import refined, with_own_mask
+from vggtjax.pipeline.run import reconstruct, refined
 from vggtjax.pipeline.running import Running
 from vggtjax.pipeline.steps import Execute
 from vggtjax.progress import OnStage, no_stage
@@ -60,7 +60,8 @@ def reconstruct_methods(
         shared = next((each for each in group if each.row.needs_second_pass), group[0]).changed(
             refine_mask=False, consistent_depth=False
         )
-        result = with_own_mask(model, clip, shared, Running(keep_passes=True, on_stage=on_stage), size=size)
+        running = Running(keep_passes=True, keep_mask=True, on_stage=on_stage)
+        result = reconstruct(model, clip, options=shared, running=running, size=size)
         for each in group:
             results[each.method] = _as_method(result, each, fusion, clip, on_stage or no_stage)
     return {name: results[name] for name in methods}

@@ -42,11 +42,12 @@ def demo(
             size = truth.images.shape[2]
             clip = load_clip(truth.images, model=model, size=size)
         from vggtjax.pipeline.agreement import agree_with_pixels
-        from vggtjax.pipeline.run import with_own_mask
+        from vggtjax.pipeline.run import reconstruct
         from vggtjax.pipeline.running import Running
         from vggtjax.results.no_mask import without_mask
 
-        predicted = with_own_mask(model, clip, Options(method), Running(on_stage=report.stage), size=size)
+        running = Running(keep_mask=True, on_stage=report.stage)
+        predicted = reconstruct(model, clip, options=Options(method), running=running, size=size)
         predicted = replace(predicted, settings=predicted.settings | {"clip": "Embedded clip"})
         result = agree_with_pixels(predicted, clip.pictures, CONSISTENT, on_stage=report.stage)
         predicted, result = without_mask(predicted), without_mask(result)

@@ -37,7 +37,7 @@ from vggtjax.network.checkpoint import Model
 from vggtjax.network.heads.track_head import check_track_size
 from vggtjax.options import Options
 from vggtjax.pipeline.agreement import agree_with_pixels
-from vggtjax.pipeline.run import with_own_mask
+from vggtjax.pipeline.run import reconstruct
 from vggtjax.pipeline.running import Running
 from vggtjax.pipeline.steps import Execute
 from vggtjax.pipeline.windows.frames import SeenFrames, count_frames, window_clips
@@ -163,7 +163,8 @@ def tools_of(
 
     def run(clip: Clip) -> Reconstruction:
         moving = load_masks(str(masks), clip) if isinstance(masks, str | Path) else masks
-        return with_own_mask(model, clip, options, Running(), size=size, masks=moving, fusion=fusion)
+        running = Running(keep_mask=True)
+        return reconstruct(model, clip, options=options, running=running, size=size, masks=moving, fusion=fusion)
 
     execute, compute = Execute(), compute_by(options)
 
