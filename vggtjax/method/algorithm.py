@@ -189,10 +189,13 @@ def run_passes(
     method, images, on_devices = options.row, clips.images, compute.frames.on_devices
     clips.check(compute.frames)
     check_masks(masks, images, compute.frames)
-    real, counted = clips.real(compute.frames), clips.counted
-    if masks is None and counted == 1:
-        masks = False  # nothing moves in a single frame
-    mines_by_matches = masks is None and method.mask == "matches" and counted >= FEWEST_FRAMES
+    real = clips.real(compute.frames)
+    # Masks are given from here on, or soft, or None: to be mined.
+    soft = masks if isinstance(masks, SoftMasking) else None
+    nothing_moves = masks is False or (masks is None and clips.counted == 1)
+    if nothing_moves:
+        masks = np.zeros(images.shape[:4], bool)
+    mines_by_matches = masks is None and method.mask == "matches" and clips.counted >= FEWEST_FRAMES
     witness = "matches" if mines_by_matches else "gram"
 
     if shared is None:
@@ -201,7 +204,7 @@ def run_passes(
         tokens = features(params, images, config=config, compute_dtype=compute.compute_dtype, remat=compute.remat)
         batch = ClipBatch(images, tokens, clips.padding(compute.frames))
         # Stage 1: a plain pass, which adds up the similarities of q and k that tell motion.
-        exponents = masks.exponents if isinstance(masks, SoftMasking) else None
+        exponents = None if soft is None else soft.exponents
         plain_pass = step("first pass", on_devices(first_pass, REPLICATED, _CLIPS, REPLICATED, REPLICATED))
         arrays = (params, batch, clips.query_points.get(0), exponents)
         first, seen = plain_pass(*arrays, config=config, gram=method.gram, witness=witness, compute=compute)
@@ -212,38 +215,32 @@ def run_passes(
 
     # What moves.
     threshold = config.motion.cut_by(options.threshold, method.threshold)
-    mined = MotionMask(masks)  # type: ignore[arg-type]
-    if masks is None:
-        evidence, predicted = (
-            (seen, only(first, FIRST_OUTPUTS)) if mines_by_matches else (Evidence(seen.saliency), None)
-        )
-        arrays = (evidence, predicted, batch._replace(frame_count=None))
-        mining = step("dynamic mask", mine)
-        mined = mining(
-            *arrays, clusters=method.clusters, threshold=threshold, smooth_frames=options.smooth_frames, frames=real
-        )
-    elif isinstance(masks, SoftMasking):
+    if soft is not None:
         shares = step("dynamic mask", mine_soft)
-        mined = MotionMask(
-            shares(seen.saliency, images, masks, threshold=config.motion.threshold or "otsu", frames=real)
-        )
-    elif masks is False:
-        mined = MotionMask(np.zeros(images.shape[:4], bool))  # type: ignore[arg-type]
+        cut = config.motion.threshold or "otsu"
+        moving = MotionMask(shares(seen.saliency, images, soft, threshold=cut, frames=real))
+    elif masks is None:
+        mining = step("dynamic mask", mine)
+        read = (seen, only(first, FIRST_OUTPUTS)) if mines_by_matches else (Evidence(seen.saliency), None)
+        how = {"clusters": method.clusters, "threshold": threshold, "smooth_frames": options.smooth_frames}
+        moving = mining(*read, batch._replace(frame_count=None), **how, frames=real)
+    else:
+        moving = MotionMask(masks)  # type: ignore[arg-type]
 
     # Stage 2: the keys of what moves are suppressed.
     second = first if method.needs_second_pass else None
-    if second is not None and masks is not False:
+    if second is not None and not nothing_moves:
         outputs = FIRST_OUTPUTS if both_outputs else method.second_outputs(options.align_scale)
-        strength = masks.strength if isinstance(masks, SoftMasking) else None
+        strength = None if soft is None else soft.strength
         pairs = config.motion.masked_pairs(options.mask_pairs) if strength is None else None
         masked_pass = step(
             "second pass", on_devices(second_pass, REPLICATED, _CLIPS, BY_FRAME, BY_FRAME, REPLICATED, REPLICATED)
         )
-        arrays = (params, batch, mined.dynamic_mask, only(first, FIRST_OUTPUTS), pairs, strength)
+        arrays = (params, batch, moving.dynamic_mask, only(first, FIRST_OUTPUTS), pairs, strength)
         second = masked_pass(*arrays, config=config, suppress=method.suppress, outputs=outputs, compute=compute)
 
     tracks = _follow(params, batch, clips.query_points, first, config, compute, step) if clips.query_points else None
-    return Passes(first, second, seen.saliency, *mined, seen.matches, batch.patch_tokens, tracks)
+    return Passes(first, second, seen.saliency, *moving, seen.matches, batch.patch_tokens, tracks)
 
 
 def _follow(
