@@ -13,8 +13,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from vggtjax.clips.clip import Clip
+from vggtjax.clips.fingerprint import source_setting
 from vggtjax.clips.queries import Queries
-from vggtjax.clips.sources import ClipSource
+from vggtjax.clips.sources import ClipSource, open_source
 from vggtjax.errors import InputError, ResultError, device_memory_errors
 from vggtjax.method.algorithm import Clips, compute_by, run_method
 from vggtjax.method.assembly import Assembly, FusionRule, as_tree, check_fuses
@@ -98,7 +99,11 @@ def reconstruct(
     options, running = changed(options, running, changes)
     given = {"size": size, "masks": masks, "tracks": tracks, "fusion": fusion, "known": known}
     mines = options.row.makes_mask or agrees_with_pixels(options) or running.keep_passes
-    return without_mask(with_own_mask(model, clip, options, running, mines=mines, **given))
+    if not isinstance(clip, Clip):
+        clip = open_source(clip)
+    of_source = source_setting(clip.source if isinstance(clip, Clip) else clip)  # before the work: it may change
+    result = without_mask(with_own_mask(model, clip, options, running, mines=mines, **given))
+    return dataclasses.replace(result, settings=result.settings | of_source)
 
 
 @own_settings()

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from vggtjax.clips.clip import Clip
+from vggtjax.clips.fingerprint import source_setting
 from vggtjax.config import MotionConfig
 from vggtjax.errors import InputError
 from vggtjax.method.assembly import FusionRule, as_tree, assemble, check_fuses
@@ -55,12 +56,13 @@ def reconstruct_methods(
     check_fuses(fusion, *methods)
     if options.refine_cameras:
         raise InputError("refine_cameras is for one method; reconstruct with each method by itself")
-    results: dict[str, Reconstruction] = {}
+    results, known = dict[str, Reconstruction](), source_setting(clip.source)
     for group in groups_of_methods(methods, options, model.config.motion):
         shared = next((each for each in group if each.row.needs_second_pass), group[0]).changed(
             refine_mask=False, consistent_depth=False
         )
         result = with_own_mask(model, clip, shared, Running(keep_passes=True, on_stage=on_stage), size=size)
+        result = dataclasses.replace(result, settings=result.settings | known)
         for each in group:
             results[each.method] = _as_method(result, each, fusion, clip, on_stage or no_stage)
     return {name: results[name] for name in methods}
