@@ -8,7 +8,7 @@ from pkgutil import resolve_name
 
 import tyro
 
-from vggtjax.errors import VggtjaxError
+from vggtjax.errors import InputError, VggtjaxError
 
 COMMANDS = {  # imported where it is called, so that one command needs no other's packages
     "accelerator": "benchmarks.accelerator.command:accelerator",
@@ -22,12 +22,15 @@ COMMANDS = {  # imported where it is called, so that one command needs no other'
     "suite": "benchmarks.suite.command:suite",
 }
 _PROGRAM = "python -m benchmarks"
+_GONE = ("approximations", "known", "long-clips", "refine-cameras", "second-pass")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a benchmark; return the exit code: 0, or 2 for bad input or output."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:
+        if given and given[0] in _GONE:
+            raise InputError(f"{given[0]} is no longer there; commit 2922dfe is the last that has it")
         if given and given[0] in COMMANDS:
             tyro.cli(_command(given[0]), prog=f"{_PROGRAM} {given[0]}", args=given[1:])
         else:

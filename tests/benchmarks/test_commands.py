@@ -85,6 +85,7 @@ def test_embed(run, tiny, tmp_path, monkeypatch):
         ("gpu-day --out {tmp}", "is not empty; choose a new folder"),
         ("static-mesh --clips 0", "clips is 0; expected at least 1"),
         ("speed --weights {tmp}/a --converted {tmp}/b --peer {tmp}", "a does not exist"),
+        ("known --clips 24", "known is no longer there; commit 2922dfe is the last that has it"),
         ("suite --against {tmp}/file", "is not a run that --out wrote"),
     ],
 )

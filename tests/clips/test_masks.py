@@ -220,5 +220,8 @@ def test_masks_of_a_video_that_count_from_1_are_said(tmp_path, first, said):
     height, width = clip.source_size[0]
     masks = [np.zeros((height, width), np.uint8)] * 6
     folder = written(tmp_path / "masks", masks, [f"{first + number:06d}.png" for number in range(6)])
-    with pytest.warns(MaskWarning, match="000003 is taken for the 4th picture") if said else nullcontext():
-        load_masks(str(folder), clip)
+    later = load_clip(str(tmp_path / "a.mp4"), start=4, max_frames=2, size=70, patch=14)
+    with pytest.warns(MaskWarning, match="000001 is taken for the second picture") if said else nullcontext() as found:
+        for part in (clip, later):  # as for windows of a long clip
+            load_masks(str(folder), part)
+    assert len({str(warning.message) for warning in found or ()}) == said  # one text, which Python says once

@@ -43,6 +43,13 @@ def test_so_are_those_of_a_gpu(frames, counted):
     assert predicted < memory.pass_bytes(vggt_1b(), frames, 392, 518, accelerator=False)
 
 
+def test_every_device_holds_all_frames_after_a_pass():
+    """XLA counts 51 bytes a pixel of all frames for the dynamic mask, on one of four devices as on one alone."""
+    model = demo_model()
+    needs = memory.predicted_bytes(model, 64, 256, 256, devices=8, accelerator=True) - model.parameter_bytes
+    assert needs > 51 * 64 * 256 * 256
+
+
 @pytest.fixture
 def two_cores(monkeypatch):
     monkeypatch.setattr("vggtjax.network.kernels.cpu_attention.times_for_cores", lambda: 1)

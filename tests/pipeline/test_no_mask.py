@@ -37,7 +37,7 @@ def test_a_result_of_one_pass_has_no_mask_and_the_same_depth_and_cameras(model, 
     alone = reconstruct(model, clip, method="vggt", size=42, on_stage=stages.stage)
     assert "first pass" in stages.seconds
     assert "dynamic mask" not in stages.seconds
-    used = reconstruct(model, clip, method="vggt", keep_mask=True, size=42)
+    used = reconstruct(model, clip, method="vggt", is_part=True, size=42)
     both = reconstruct_methods(model, clip, ["vggt", "4dvggt-d"], size=42)
     assert used.dynamic_mask.any()
     for result in (alone, both["vggt"]):

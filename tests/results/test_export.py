@@ -8,6 +8,7 @@ from PIL import Image
 
 from tests.clips.captures.folders import make_truth, tum
 from tests.shared.room import make_room
+from tests.shared.tiny import tiny_config
 from vggtjax import load_clip
 from vggtjax.errors import InputError, OutputError
 from vggtjax.options import Options
@@ -20,6 +21,7 @@ from vggtjax.results.saving import Saving
 from vggtjax.storage.trajectories import associate, read_trajectory
 
 pytestmark = pytest.mark.usefixtures("empty_reports")
+MODEL = cast(Any, SimpleNamespace(note="", config=tiny_config()))
 
 FILES = {"reconstruction.npz", "trajectory.txt", "intrinsics.txt", "static.ply", "scene.glb", "report.html"}
 FILES |= {"depth/scale.txt", "preview/sheet.png", "preview/card.webp"}
@@ -251,7 +253,7 @@ def test_a_capture_tells_its_clock(tmp_path, named):
     clip = load_clip(folder, size=28)
     assert clip.timestamps is not None
     assert clip.timestamps[0] == 0
-    settings = settings_of(cast(Any, SimpleNamespace(note="")), clip, Options(), "cues", None)
+    settings = settings_of(MODEL, clip, Options(), "cues", None)
     assert settings["first_time"] == 100
 
 
@@ -260,7 +262,7 @@ def test_files_have_nanoseconds_that_no_float_holds(tmp_path):
     for name in names:
         Image.new("RGB", (28, 28)).save(tmp_path / f"{name}.png")
     clip = load_clip(tmp_path, size=28)
-    settings = settings_of(cast(Any, SimpleNamespace(note="")), clip, Options(), "cues", None)
+    settings = settings_of(MODEL, clip, Options(), "cues", None)
     room = make_room(3, timestamps=clip.timestamps, frame_names=tuple(clip.frame_names), settings=settings)
     assert room.known_facts["times"] == "from the names of the frames, in nanoseconds"
     room.save(tmp_path / "out", only=("cameras",))

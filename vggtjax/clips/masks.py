@@ -43,6 +43,10 @@ _DEEP_LABELS = ("I", "I;16", "I;16B", "I;16L", "I;16N")  # and of 16 or 32 bits,
 _DEEP_WHITE = 65535
 _SAME_SHAPE, _ACROSS = (2, 3, 4), (5, 6, 7, 8)  # orientations of EXIF that leave and that swap width and height
 _NEARLY = 16  # values by which black and white may be off; others are those of a picture
+_FROM_ONE = (
+    "the masks are numbered from 1 on, and frames of a video from 0: mask 000001 is taken for the second picture; if "
+    "the masks count from 1, as FFmpeg writes them, rename them"
+)
 _FEW_GREYS = 0.1  # share of the opaque pixels of a mask that are neither black nor white: its edges
 
 
@@ -77,7 +81,7 @@ def load_masks(folder: str | Path, clip: Clip) -> Bool[np.ndarray, "S H W"]:
         if twice := [name for name in clip.frame_names if names[name] > 1]:
             raise ClipError(f"{folder} has {names[twice[0]]} pictures named {twice[0]}; expected one for each frame")
         paths = [by_name[name] for name in clip.frame_names]
-        _warn_of_first_number(folder, by_name, clip)
+        _warn_of_first_number(by_name, clip)
     elif named or len(source.paths) != len(clip):
         missing = next(name for name in clip.frame_names if name not in by_name)
         raise ClipError(
@@ -115,16 +119,11 @@ def masks_at_clip_pixels(
     return fitted
 
 
-def _warn_of_first_number(folder: str | Path, names: Iterable[str], clip: Clip) -> None:
+def _warn_of_first_number(names: Iterable[str], clip: Clip) -> None:
     """Give a MaskWarning where masks of a video are numbered from 1, as FFmpeg does, and its frames from 0."""
     numbers = {int(name) for name in names if name.isdecimal()}
     if 1 in numbers and 0 not in numbers and isinstance(clip.source, VideoFile):
-        name = clip.frame_names[0]
-        text = (
-            f"{folder} has masks from 1 on, and frames of a video count from 0: mask {name} is taken for the "
-            f"{int(name) + 1}th picture of the video; if the masks count from 1, as FFmpeg writes them, rename them"
-        )
-        warnings.warn(text, MaskWarning, stacklevel=4)
+        warnings.warn(_FROM_ONE, MaskWarning, stacklevel=4)
 
 
 def _warn_of_inverted(masks: Bool[np.ndarray, "S H W"], clip: Clip, advice: str) -> None:

@@ -36,10 +36,11 @@ ClipSource: TypeAlias = Name | Sequence[Name] | Sequence[Image.Image] | Sequence
 _OPENED = (ImageFiles, VideoFile, Animation, ArrayFrames)
 
 
-def open_source(source: ClipSource, *, undistort: bool = True) -> Source:
+def open_source(source: ClipSource, *, undistort: bool | None = True) -> Source:
     """Return the source of frames that `source` names, without reading the frames; `load_clip` lists what it can be.
 
-    With `undistort` the frames of a capture that has coefficients of its lens are those that a pinhole would see.
+    With `undistort` the frames of a capture that has coefficients of its lens are those that a pinhole would see; with
+    None they are as they are, whatever the lens: to look at files.
     Raises ClipError for a missing source, one without frames, or lenses that no pinhole stands for, and
     MissingExtraError where frames are to be undistorted and pycolmap is not installed.
     """
@@ -130,7 +131,7 @@ def _is_clip(entry: Path) -> bool:
     return not entry.name.startswith(".") and (entry.is_dir() or is_video_name(entry) or bool(capture_kind(entry)))
 
 
-def _from_path(name: str, undistort: bool) -> Source:
+def _from_path(name: str, undistort: bool | None) -> Source:
     path = Path(name)
     with reading(name, ClipError):
         if not name or "\0" in name:
@@ -169,12 +170,12 @@ def _pattern(path: Path) -> str:
     return os.path.join(glob.escape(str(there)), path.relative_to(there))  # noqa: PTH118
 
 
-def _capture(path: Path, undistort: bool) -> CaptureFrames | None:
+def _capture(path: Path, undistort: bool | None) -> CaptureFrames | None:
     try:
         capture = find_capture(path)
         if capture is not None and undistort:
             capture = capture.undistorted()
-        elif capture is not None:
+        elif capture is not None and undistort is not None:
             check_no_fisheye(capture.lenses, path)
     except InputError as error:
         raise ClipError(f"{error}; name the folder of the pictures to leave its cameras out") from error

@@ -10,7 +10,6 @@ from jaxtyping import Float
 
 from vggtjax.clips.captures.frames import CaptureFrames
 from vggtjax.clips.clip import Clip
-from vggtjax.clips.fingerprint import fingerprint
 from vggtjax.clips.media.images import ImageFiles
 from vggtjax.clips.queries import Queries
 from vggtjax.clips.shots import looks_of
@@ -86,7 +85,6 @@ def settings_of(
     settings = {name: value for name, value in options.to_json().items() if name != "method"}
     settings |= {"mode": clip.mode, "size": clip.size, "patch": clip.patch}
     settings |= {"masks": mask_source, "consistent_depth": options.consistent_depth, "cues": model.config.motion.digest}
-    settings |= {"source": fingerprint(clip.source)}
     settings |= {} if fusion is None else {"fusion": fusion_digest(fusion)}
     settings |= {"clip": clip.source.name} if clip.source.name else {}
     if isinstance(clip.source, ImageFiles) and (times := clip.source.times) is not None:

@@ -85,11 +85,12 @@ def predicted_bytes(
     """
     host = on_cpu() if accelerator is None else not accelerator
     here = min(devices, jax.local_device_count()) if host else 1  # devices that share one memory
+    picture = clips * (_CPU if host else _ACCELERATOR).pixel * height * width
     held = frames if host else -(-frames // devices)  # every process loads the whole clip and returns all of it
-    pictures = clips * held * (_CPU if host else _ACCELERATOR).pixel * height * width
-    run = here * pass_bytes(model.config, frames, height, width, devices=devices, accelerator=not host) + pictures
+    run = here * pass_bytes(model.config, frames, height, width, devices=devices, accelerator=not host) + held * picture
     if host:
         run = _PROCESS + max(run, _COMPILING if _second_is_another(find_method(method)) else 0)
+    run = max(run, frames * picture)  # after a pass, every device reads all frames
     return here * model.parameter_bytes + run
 
 

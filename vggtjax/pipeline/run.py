@@ -13,8 +13,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from vggtjax.clips.clip import Clip
+from vggtjax.clips.fingerprint import source_setting
 from vggtjax.clips.queries import Queries
-from vggtjax.clips.sources import ClipSource
+from vggtjax.clips.sources import ClipSource, open_source
 from vggtjax.errors import InputError, ResultError, device_memory_errors
 from vggtjax.method.algorithm import Clips, compute_by, run_method
 from vggtjax.method.assembly import Assembly, FusionRule, as_tree, check_fuses
@@ -101,6 +102,8 @@ def reconstruct(
         options.check_given_masks()
     options = options.resolved(model.config.motion)
     _check(options, running, tracks, fusion, known)
+    clip = clip if isinstance(clip, Clip) else open_source(clip)
+    of_source = {} if running.is_part else source_setting(getattr(clip, "source", clip))  # as it is before the work
     inputs = read_inputs(model, clip, size=size, masks=masks, tracks=tracks, known=known, on_stage=running.stage)
 
     run = partial(run_method, **_arguments(model, inputs, options, running, fusion))
@@ -120,7 +123,8 @@ def reconstruct(
     if options.refine_mask and result.has_mask:
         with running.stage("refine mask") as progress:
             result = refined(result, progress, unit)
-    return result if running.keep_mask else without_mask(result)
+    result = dataclasses.replace(result, settings=result.settings | of_source)
+    return result if running.is_part else without_mask(result)
 
 
 @own_settings()
@@ -220,7 +224,7 @@ def _arguments(
     params, rule = model.params, as_tree(fusion)
     if mesh is not None:
         params, rule = replicate((params, rule), mesh)
-    mines = options.row.makes_mask or agrees_with_pixels(options) or running.keep_passes or running.keep_mask
+    mines = options.row.makes_mask or agrees_with_pixels(options) or running.keep_passes or running.is_part
     return {
         "params": params,
         "clips": Clips(

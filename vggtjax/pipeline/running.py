@@ -20,14 +20,15 @@ class Running:
         pad_frames: pad the clip to one of a few lengths, so that clips of similar length share compiled programs. Not
             for clips with tracks.
         keep_passes: keep both passes on the result, as `.passes`.
-        keep_mask: keep the dynamic mask that the steps used on the result, also of a method that makes none.
+        is_part: the caller makes a result of its own of this one, which keeps the dynamic mask that its steps used,
+            also of a method that makes none, and does not name its source.
         on_stage: called with the name of each stage, returns a context in which the stage runs; None for none.
     """
 
     devices: int = 1
     pad_frames: bool = False
     keep_passes: bool = False
-    keep_mask: bool = False
+    is_part: bool = False
     on_stage: OnStage | None = None
 
     @property

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from vggtjax.clips.clip import Clip
+from vggtjax.clips.fingerprint import source_setting
 from vggtjax.config import MotionConfig
 from vggtjax.errors import InputError
 from vggtjax.method.assembly import FusionRule, as_tree, assemble, check_fuses
@@ -55,13 +56,14 @@ def reconstruct_methods(
     check_fuses(fusion, *methods)
     if options.refine_cameras:
         raise InputError("refine_cameras is for one method; reconstruct with each method by itself")
-    results: dict[str, Reconstruction] = {}
+    results, known = dict[str, Reconstruction](), source_setting(clip.source)
     for group in groups_of_methods(methods, options, model.config.motion):
         shared = next((each for each in group if each.row.needs_second_pass), group[0]).changed(
             refine_mask=False, consistent_depth=False
         )
-        running = Running(keep_passes=True, keep_mask=True, on_stage=on_stage)
+        running = Running(keep_passes=True, is_part=True, on_stage=on_stage)
         result = reconstruct(model, clip, options=shared, running=running, size=size)
+        result = dataclasses.replace(result, settings=result.settings | known)
         for each in group:
             results[each.method] = _as_method(result, each, fusion, clip, on_stage or no_stage)
     return {name: results[name] for name in methods}

@@ -1,4 +1,4 @@
-"""The user's cache folder: converted weights, traced and compiled programs, passes for fits. Does not import jax."""
+"""The user's cache folder: converted weights, compiled programs, passes for fits. Does not import jax."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TRIALS = "trials"  # of what this computer does fast
 _KINDS = {
     "compiled programs": "compiled",
     "digests and shapes": "texts",
-    "traced programs of earlier versions": "lowered",
+    "programs of earlier versions": "lowered",
     "passes for fits": "passes",
     "trials of the processor": TRIALS,
 }

@@ -18,6 +18,7 @@ def _package_digest() -> str:
     return digest.hexdigest()
 
 
+@cache
 def running_versions() -> str:
     """Return in words which code runs in this process: equal words, equal results."""
     from vggtjax import __version__

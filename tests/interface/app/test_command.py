@@ -22,6 +22,7 @@ pytestmark = pytest.mark.skipif(find_spec("gradio") is None, reason="the app nee
         ("--host 127.0.0.1 --password=", "--password is 0 characters long; expected at least 8"),
         ("--token 0123456789abcdef", "app --token is no longer there: --password"),
         ("--max-results=3", "app --max-results is no longer there: results are removed after a day"),
+        ("--max_results 3", "app --max-results is no longer there: results are removed after a day"),
         ("--max-waiting 0", "--max-waiting is 0"),
         ("--port 70000", "--port is 70000; expected 0 to 65535"),
     ],

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from tests.shared.room import make_room
-from vggtjax.errors import ClipError, InputError, ResultError
+from vggtjax.errors import CheckpointError, ClipError, InputError, ResultError
 from vggtjax.interface.app import outputs
 from vggtjax.interface.app.limits import Limits
 from vggtjax.interface.app.run import Runner, sentence
@@ -61,6 +61,18 @@ def test_a_cancelled_job_leaves_no_file(tmp_path):
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.usefixtures("tiny_demo")
+def test_a_job_of_no_frames_has_one(tmp_path, reconstructed):
+    def on_stage(name):
+        if name == "write files":
+            raise KeyError(name)
+        return nullcontext()
+
+    with pytest.raises(KeyError):
+        Runner((), Limits()).run([], "demo", "vggt", 0, 0, tmp_path, on_stage)
+    assert reconstructed[0][0][0] == 1
+
+
 @pytest.mark.usefixtures("tiny_demo", "reconstructed")
 @pytest.mark.parametrize(("name", "stem"), [("..<b> c.png", "b-c"), ("....png", "clip"), ("é" * 90 + ".png", "clip")])
 def test_results_have_safe_names(tmp_path, name, stem):
@@ -78,7 +90,7 @@ def test_files_are_checked_before_the_model_is_loaded(tmp_path, monkeypatch):
     (tmp_path / "holiday.mp4").write_bytes(b"words")
     with pytest.raises(ClipError) as raised:
         Runner((), Limits()).run([tmp_path / "holiday.mp4"], "demo", "vggt", 2, 0, tmp_path, lambda _: nullcontext())
-    said = sentence(raised.value, tmp_path)
+    said = sentence(raised.value, [tmp_path])
     assert said.startswith("cannot read video holiday.mp4")
     assert str(tmp_path) not in said
 
@@ -93,6 +105,7 @@ def test_models_have_names_without_folders_and_one_name_each(tmp_path):
         "facebook/VGGT-1B",
         "demo",
     ]
+    assert tmp_path / "a" in Runner((first,), Limits()).folders
     with pytest.raises(InputError, match=r"two models are named large\.safetensors"):
         Runner((first, second), Limits())
     with pytest.raises(InputError, match="model is 'other'"):
@@ -108,6 +121,7 @@ def test_models_have_names_without_folders_and_one_name_each(tmp_path):
             "x.mp4: broken; see https://a.org/b/c",
         ),
         (ClipError("cannot read (/home/me/models/x.npz)"), "cannot read (x.npz)"),
+        (CheckpointError("/srv/my models/large/x.safetensors is cut off"), "x.safetensors is cut off"),
         (MemoryError(), "this machine has too little memory for the job; choose fewer frames"),
         (
             RuntimeError("RESOURCE_EXHAUSTED: secret"),
@@ -118,4 +132,4 @@ def test_models_have_names_without_folders_and_one_name_each(tmp_path):
     ],
 )
 def test_an_error_is_a_sentence_without_paths(error, said):
-    assert sentence(error, Path("/tmp/a b/app")) == said
+    assert sentence(error, [Path("/tmp/a b/app"), Path("/srv"), Path("/srv/my models")]) == said

@@ -146,6 +146,14 @@ def test_without_a_password_requests_name_this_machine(client):
         assert client.get("/", headers={"host": host}).status_code == 400
 
 
+def test_pages_of_other_sites_send_nothing(client):
+    file = {"files": ("a.png", b"")}
+    for site, code in (("cross-site", 403), ("same-origin", 200), ("none", 200)):
+        answer = client.post("/gradio_api/upload", files=file, headers={"sec-fetch-site": site})
+        assert answer.status_code == code, site
+    assert client.get("/", headers={"sec-fetch-site": "cross-site"}).status_code == 200  # as a link there asks
+
+
 def test_other_machines_need_the_password(tiny_demo_file, tmp_path):
     httpx = pytest.importorskip("httpx")
     options = "--host", "0.0.0.0", "--password", PASSWORD
@@ -162,3 +170,5 @@ def test_other_machines_need_the_password(tiny_demo_file, tmp_path):
             assert client.post("/login", data={"username": user, "password": password}).status_code >= 400
         assert client.post("/login", data={"username": "vggtjax", "password": PASSWORD}).status_code == 200
         assert upload(client, "a.png", b"").status_code == 200
+        client.headers["sec-fetch-site"] = "cross-site"  # with the cookie
+        assert upload(client, "a.png", b"").status_code == 403

@@ -223,7 +223,7 @@ def test_a_mistyped_command_or_flag_names_the_one_that_was_meant(capsys):
     assert code == 2
     assert err == ("vggtjax: there is no command 'recontsruct'; did you mean reconstruct? vggtjax --help lists all\n")
     assert "did you mean" not in run(capsys, "zzzz")[2]
-    for gone in (("export-model", "demo", "--out", "x"), ("view", "x", "--format=viser")):
+    for gone in (("export-model", "demo", "--out", "x"), ("export_model",), ("view", "x", "--format=viser")):
         code, _, err = run(capsys, *gone)
         assert (code, "is no longer there: " in err) == (2, True)
     with pytest.raises(SystemExit) as stop:

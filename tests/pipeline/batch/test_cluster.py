@@ -7,6 +7,7 @@ import subprocess
 import sys
 from functools import partial
 from types import SimpleNamespace
+from weakref import WeakSet
 
 import numpy as np
 import pytest
@@ -15,12 +16,15 @@ from PIL import Image
 from tests.shared.moving_ball import moving_ball
 from tests.shared.room import make_room
 from tests.shared.tiny import tiny_model
-from vggtjax.errors import ClusterError, InputError
+from vggtjax.clips.fingerprint import source_setting
+from vggtjax.clips.sources import open_source
+from vggtjax.errors import ClusterError, InputError, MissingExtraError
 from vggtjax.network.checkpoint import save_model
 from vggtjax.options import Options
-from vggtjax.pipeline.batch.cluster import Cluster, Worker, reconstruct_on_cluster, shared
+from vggtjax.pipeline.batch.cluster import Cluster, reconstruct_on_cluster, shared
 from vggtjax.pipeline.batch.destination import SETTINGS_NAME, LocalFolder
-from vggtjax.pipeline.batch.recipe import BatchRecipe, ClipOutcome
+from vggtjax.pipeline.batch.recipe import CHANGED, BatchRecipe, ClipOutcome
+from vggtjax.pipeline.batch.worker import Worker
 from vggtjax.results.archive import ARCHIVE_NAME
 from vggtjax.storage.versions import running_versions
 
@@ -78,11 +82,19 @@ def test_a_killed_worker_costs_its_clips_alone_and_they_are_run_again(tmp_path):
     assert {path.name for path in out.iterdir()} == {path.name for path in (tmp_path / "alone").iterdir()}
 
 
+class Handle:
+    """Of a worker, which ends with its last handle."""
+
+    def __init__(self, asked):
+        self.ready = self.run = SimpleNamespace(remote=asked)
+
+
 class FakeRay(SimpleNamespace):
     """Stands for Ray, with two machines of a CPU: `answers` are those of workers, by the name of the clip."""
 
     def __init__(self, answers):
         self.calls, self.answers, self.options_given = {}, answers, {}
+        self.handles, self.at_once = WeakSet(), []  # of workers that are there, and their number at each answer
         super().__init__(init=lambda **_: None, shutdown=lambda: None)
 
     def nodes(self):
@@ -100,13 +112,15 @@ class FakeRay(SimpleNamespace):
             self.calls[len(self.calls)] = clip[0] if clip else "ready"
             return len(self.calls) - 1
 
-        return SimpleNamespace(ready=SimpleNamespace(remote=asked), run=SimpleNamespace(remote=asked))
+        self.handles.add(handle := Handle(asked))
+        return handle
 
     def wait(self, calls, timeout):
         return calls[:1], calls[1:]
 
     def get(self, call):
         name = self.calls[call]
+        self.at_once.append(len(self.handles))
         answer = self.answers.get(name, ClipOutcome(name, "done"))
         answer = answer.pop(0) if isinstance(answer, list) else answer
         if isinstance(answer, Exception):
@@ -135,9 +149,29 @@ def test_a_clip_that_ends_a_worker_twice_fails_and_the_others_do_not(monkeypatch
     assert {name for name, outcome in made.items() if outcome.status == "done"} == set("acd")
     assert "two workers ended with it in their work" in made["b"].reason
     assert list(ray.calls.values()) == ["ready", "ready", "a", "b", "c", "d"]  # two workers, a clip each
+    assert ray.at_once == [2, 2, 2, 2, 2, 1]  # one ends as no clip waits for it
     assert ray.options_given == {"num_cpus": 1, "num_gpus": 0.0, "max_restarts": -1, "max_task_retries": 1}
     assert notes == ["the first worker is ready"]
     assert json.loads((tmp_path / "out" / SETTINGS_NAME).read_text())["size"] == 56
+
+
+def test_a_worker_that_never_begins_leaves_the_clips_to_the_others(monkeypatch, tmp_path):
+    from ray.exceptions import RayActorError
+
+    made, ray, notes = outcomes(monkeypatch, tmp_path / "out", {"ready": [RayActorError(), READY]})
+    assert {outcome.status for outcome in made.values()} == {"done"}
+    assert list(ray.calls.values()) == ["ready", "ready", "a", "b", "c", "d"]
+    assert ray.at_once[2:] == [1, 1, 1, 1]
+    assert notes[0].startswith("a worker ended before it was ready: ")
+    assert notes[1:] == ["the first worker is ready"]
+
+
+def test_urls_need_their_extra_before_any_work(monkeypatch, tmp_path):
+    monkeypatch.setattr("vggtjax.errors.find_spec", lambda name: name != "fsspec")
+    for source, out in (("s3://bucket/a.mp4", str(tmp_path / "out")), ("a.mp4", "s3://bucket/out")):
+        with pytest.raises(MissingExtraError, match="needs the extra 'remote'"):
+            next(reconstruct_on_cluster(lambda: (None, None), {"a": source}, out, Cluster("ray"), RECIPE))
+    assert not any(tmp_path.iterdir())
 
 
 def test_workers_of_other_code_and_other_files_and_those_that_cannot_begin(monkeypatch, tmp_path):
@@ -175,9 +209,12 @@ def test_a_worker_does_a_clip_once(tmp_path, monkeypatch):
     worker = Worker(lambda: (model, None), RECIPE, LocalFolder(tmp_path / "out"), str(tmp_path), None)
     versions, settings, _ = worker.ready()
     assert (versions, settings["method"]) == (running_versions(), "vggt")
-    worker._work.reconstruct_or_cut = lambda name, clip, seconds: make_room()  # type: ignore[union-attr]
+    known = source_setting(open_source("a.png"))
+    worker._work.reconstruct_or_cut = lambda name, clip, seconds: make_room(settings=known)  # type: ignore[union-attr]
     assert worker.run("a", "a.png") == ClipOutcome("a", "done", frames=1)
     assert worker.run("a", "a.png").status == "kept"
+    Image.fromarray(np.ones((70, 98, 3), np.uint8)).save(tmp_path / "a.png")
+    assert worker.run("a", "a.png") == ClipOutcome("a", "done", CHANGED, frames=1)
     assert "'b.png' does not exist" in worker.run("b", "b.png").reason
     worker._work.load = lambda source: 1 / 0  # type: ignore[union-attr]
     assert "ZeroDivisionError" in worker.run("c", "a.png").reason

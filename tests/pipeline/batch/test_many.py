@@ -20,8 +20,9 @@ from vggtjax.clips.sources import clips_by_name
 from vggtjax.errors import ClipError, InputError, OutputError
 from vggtjax.interface.commands import main as cli
 from vggtjax.network.checkpoint import save_model
-from vggtjax.pipeline.batch.destination import CHANGED, PAGE_NAME, SETTINGS_NAME
+from vggtjax.pipeline.batch.destination import PAGE_NAME, SETTINGS_NAME
 from vggtjax.pipeline.batch.many import reconstruct_many
+from vggtjax.pipeline.batch.recipe import CHANGED, ClipOutcome
 from vggtjax.results.archive import ARCHIVE_NAME
 
 pytestmark = pytest.mark.filterwarnings("ignore:the field of view")
@@ -168,7 +169,7 @@ def test_clips_from_urls_and_results_at_urls(model, clips, tmp_path, monkeypatch
         next(run({}, "https://h/results"))
 
 
-def test_two_batches_on_one_folder(model, clips, tmp_path):
+def test_two_batches_on_one_folder(model, clips, tmp_path, monkeypatch):
     sources = {name: str(clips / name) for name in ("clip0", "clip1")}
     run = partial(reconstruct_many, model, sources, tmp_path, method="vggt", only=())
     first = run()
@@ -176,8 +177,12 @@ def test_two_batches_on_one_folder(model, clips, tmp_path):
     with pytest.raises(OutputError, match="another run is writing a batch"):
         next(run())
     assert [outcome.status for outcome in first] == ["done"]
-    again = [outcome.status for outcome in run()]
-    assert again == ["kept", "kept"]
+    asked = []
+    monkeypatch.setattr("vggtjax.pipeline.batch.many.has_changed", lambda place, name, source: asked.append(name))
+    again = run()
+    assert next(again) == ClipOutcome("clip0", "kept")
+    assert asked == ["clip0"]  # the other sources are not read before it is told
+    assert next(again) == ClipOutcome("clip1", "kept")
 
 
 def test_shards_at_once_are_one_batch(model, clips, tmp_path):

@@ -46,6 +46,15 @@ def path_error(result) -> float:
     return np.linalg.norm(umeyama_sim3(found, true).apply(found) - true, axis=1).max() / np.ptp(true, axis=0).max()
 
 
+def test_a_result_knows_its_source_which_is_looked_at_once(tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(
+        "vggtjax.pipeline.windows.run.source_setting", lambda source: seen.append(source) or {"source": "x"}
+    )
+    assert reconstructed(tmp_path, exact).settings["source"] == "x"
+    assert len(seen) == 1
+
+
 def test_exact_windows_give_the_exact_path_and_depth(tmp_path):
     result, true = reconstructed(tmp_path, exact, loops=True), walk()
     assert path_error(result) < 1e-5

@@ -15,6 +15,8 @@ import gradio as gr
 from gradio.themes import Default
 from starlette.middleware import Middleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
+from starlette.responses import PlainTextResponse
+from starlette.types import ASGIApp, Receive, Scope, Send
 
 from vggtjax.interface.app.run import DEMO, Runner, sentence
 from vggtjax.options import METHODS
@@ -37,7 +39,7 @@ class Jobs:
     """Runs the jobs of the page: a cancelled one goes on to its next step, for which the next one waits."""
 
     def __init__(self, runner: Runner, folder: Path) -> None:
-        self.runner, self.folder, self.results = runner, folder, folder / "results"
+        self.runner, self.folders, self.results = runner, [folder, *runner.folders], folder / "results"
         self._turn, self._owner, self._stop = threading.Lock(), "", threading.Event()
 
     def run(self, request: gr.Request, files, model, method, frames, fps, progress=_PROGRESS) -> list[Any]:
@@ -63,7 +65,7 @@ class Jobs:
         except CancelledError:
             raise gr.Error("cancelled", print_exception=False) from None
         except Exception as error:
-            raise gr.Error(html.escape(sentence(error, self.folder)), duration=None, print_exception=False) from None
+            raise gr.Error(html.escape(sentence(error, self.folders)), duration=None, print_exception=False) from None
         viewer, *others = map(str, shown)
         return [facts, gr.Column(visible=True), _VIEWER.format(quote(viewer)), *others, [*map(str, offered)]]
 
@@ -92,7 +94,7 @@ def build_page(jobs: Jobs) -> gr.Blocks:
                 cancel = gr.Button("Cancel", variant="stop", elem_id="cancel")
                 model = gr.Dropdown(names, value=names[0], label="Model", info=_MODELS)
                 method = gr.Dropdown(list(METHODS), value="4dvggt-d", label="Method", info=_METHODS)
-                frames = gr.Slider(min(2, most - 1), most, min(16, most), step=1, label="Frames")
+                frames = gr.Slider(max(1, min(2, most - 1)), most, min(16, most), step=1, label="Frames")
                 fps = gr.Slider(0, 30, 0, step=0.5, label="Frames per second", info=_FPS)
             with gr.Column(scale=5, min_width=320):
                 status = gr.Markdown("What comes out is shown here.", elem_id="status", container=True)
@@ -121,9 +123,24 @@ def build_page(jobs: Jobs) -> gr.Blocks:
     return page.queue(max_size=limits.max_waiting, default_concurrency_limit=1, api_open=False)
 
 
+class NotFromOtherSites:
+    """Refuses what pages of other sites post: the browser would send it with the name and password of its user."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request, or hand it on."""
+        if scope.get("method") == "POST" and (b"sec-fetch-site", b"cross-site") in scope["headers"]:
+            await PlainTextResponse("this comes from another site", 403)(scope, receive, send)
+        else:
+            await self._app(scope, receive, send)
+
+
 def serve(runner: Runner, folder: Path, host: str, port: int, password: str | None, ready: Callable[[], None]) -> None:
     """Serve the app until SIGINT. Without a password, requests must name this machine; no other site can."""
     by_name = Middleware(TrustedHostMiddleware, allowed_hosts=["localhost", "127.0.0.1", "[::1]", host])
+    guards = [Middleware(NotFromOtherSites), *([] if password else [by_name])]
     page = build_page(jobs := Jobs(runner, folder))
     try:
         page.launch(
@@ -133,7 +150,7 @@ def serve(runner: Runner, folder: Path, host: str, port: int, password: str | No
             auth_message=f"Sign in as {USER}.",
             max_file_size=runner.limits.max_upload_mb * 1_000_000,
             allowed_paths=[str(jobs.results)],
-            app_kwargs={"middleware": [] if password else [by_name], "openapi_url": None},
+            app_kwargs={"middleware": guards, "openapi_url": None},
             theme=Default(primary_hue="teal", font=("system-ui", "sans-serif"), font_mono=("monospace",)),
             css_paths=Path(__file__).with_name("page.css"),
             **_PLAIN,

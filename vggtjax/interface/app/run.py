@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import re
 import secrets
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +13,7 @@ from vggtjax.errors import InputError, VggtjaxError, check_choice
 from vggtjax.interface.app.limits import Limits
 from vggtjax.interface.app.uploads import checked_clip
 from vggtjax.progress import OnStage, Progress
+from vggtjax.storage.cache import cache_folder
 
 if TYPE_CHECKING:
     from vggtjax.network.checkpoint import Model
@@ -30,6 +31,9 @@ class Runner:
             shown = Path(name).name if Path(name).exists() else name  # of a file, without its folder
             if (other := self.names.setdefault(shown, name)) != name:
                 raise InputError(f"two models are named {shown}: {other} and {name}; rename one of them")
+        files = [Path(name) for name in self.names.values() if Path(name).exists()]
+        own = {folder for file in files for folder in (file.parent, file.absolute().parent)} - {Path()}
+        self.folders = [Path.home(), cache_folder(), *own]  # of this machine, which an error could name
         self._loaded: tuple[str, Model] | None = None
 
     def model(self, name: str, progress: Progress | None = None) -> Model:
@@ -49,6 +53,7 @@ class Runner:
 
         The files are checked before the model is loaded. Raises VggtjaxError, and what `on_stage` raises.
         """
+        frames = max(1, frames)
         with on_stage("check the clip"):
             checked = checked_clip(files, frames, fps, self.limits) if files else None
         with on_stage("load model") as progress:
@@ -72,10 +77,11 @@ class Runner:
         return write_outputs(result, results / secrets.token_urlsafe(16) / f"{stem}-{method}", on_stage)
 
 
-def sentence(error: Exception, uploads: Path) -> str:
-    """Return what a user reads of an error: of our own its sentence, without the folders of this machine."""
+def sentence(error: Exception, folders: Iterable[Path]) -> str:
+    """Return what a user reads of an error: of our own its sentence, without `folders` and others of this machine."""
     if isinstance(error, VggtjaxError):
-        return re.sub(rf"{re.escape(str(uploads))}/(?:[0-9a-f]{{64}}/)?|(?<![\w:/])/(?:[^\s/]+/)+", "", str(error))
+        known = "|".join(re.escape(folder) for folder in sorted(map(str, folders), key=len, reverse=True))
+        return re.sub(rf"(?<![\w:/])(?:(?:{known})/(?:[^\s/]+/)*|/(?:[^\s/]+/)+)", "", str(error))
     if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
         return "this machine has too little memory for the job; choose fewer frames"
     logging.getLogger(__name__).error("a job failed", exc_info=error)

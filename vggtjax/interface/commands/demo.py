@@ -46,7 +46,7 @@ def demo(
         from vggtjax.pipeline.running import Running
         from vggtjax.results.no_mask import without_mask
 
-        running = Running(keep_mask=True, on_stage=report.stage)
+        running = Running(is_part=True, on_stage=report.stage)
         predicted = reconstruct(model, clip, options=Options(method), running=running, size=size)
         predicted = replace(predicted, settings=predicted.settings | {"clip": "Embedded clip"})
         result = agree_with_pixels(predicted, clip.pictures, CONSISTENT, on_stage=report.stage)

@@ -161,10 +161,10 @@ def _renamed(argument: str) -> str:
 
 
 def _refuse_gone(name: str, arguments: Sequence[str]) -> None:
-    given = f" {' '.join(arguments)} ".replace("=", " ")
+    given = f" {' '.join(arguments)} ".replace("=", " ").replace("_", "-")
     for gone, instead in _GONE.items():
         command, _, flag = gone.partition(" ")
-        if name == command and (not flag or f" {flag} " in given):
+        if name.replace("_", "-") == command and (not flag or f" {flag} " in given):
             raise InputError(f"{gone} is no longer there: {instead}")
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -13,17 +12,16 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta
 
-from vggtjax.clips.fetched import Fetched
 from vggtjax.errors import ClusterError, InputError, VggtjaxError, check_extra, one_line
 from vggtjax.pipeline.batch.contact import contact_page
-from vggtjax.pipeline.batch.destination import Destination, LocalFolder, RemoteFolder, destination, has_changed
+from vggtjax.pipeline.batch.destination import Destination, LocalFolder, destination
 from vggtjax.pipeline.batch.recipe import BatchRecipe, ClipOutcome, counted, failed, invalid_name
+from vggtjax.pipeline.batch.worker import Load, Worker
 from vggtjax.progress import Progress, no_progress
 from vggtjax.storage.json_values import Count, check_fields
 from vggtjax.storage.remote import is_in_process, is_url
 from vggtjax.storage.versions import running_versions
 
-Load = Callable[[], tuple[Any, Any]]  # of a model, and a fitted rule of fusion or None
 Note = Callable[[str], None]
 _PATIENCE = 60.0  # seconds without a worker before a word about it
 
@@ -56,41 +54,6 @@ class Cluster:
             raise InputError(f"address is {self.address}; expected host:port; run this on a machine of the cluster")
 
 
-class Worker:
-    """An actor: one model, and clips by name. Ray starts its process anew where it ends, and calls `run` once more."""
-
-    def __init__(self, load: Load, recipe: BatchRecipe, out: Destination, folder: str, threads: int | None) -> None:
-        """`folder` is where relative paths start, `threads` are for computing on a CPU; None for all."""
-        self._load, self._recipe, self._out, self._folder, self._threads = load, recipe, out, folder, threads
-        self._work: Any = None
-        self._fetched, self._warning = Fetched(), ""
-
-    def ready(self) -> tuple[str, dict[str, Any], str]:
-        """Load the model, unless it is there; return which code runs, the settings, and what is to be said."""
-        from vggtjax.pipeline.batch.clip_work import ClipWork
-
-        if self._work is None:
-            with suppress(OSError):  # a machine without the folder: relative paths are not found
-                os.chdir(self._folder)
-            if self._threads is not None:
-                os.environ.setdefault("NPROC", str(self._threads))  # XLA asks for it when jax begins
-            model, fusion = self._load()
-            self._warning, self._work = model.warning, ClipWork(model, fusion, self._recipe, self._out)
-        return running_versions(), self._work.settings, self._warning
-
-    def run(self, name: str, source: str) -> ClipOutcome:
-        """Do a clip, unless its result is there."""
-        try:
-            self.ready()
-            done = self._out.has(name) and not has_changed(self._out, name, source)
-            return ClipOutcome(name, "kept") if done else self._work.run(name, self._fetched.local(name, source))
-        except Exception as error:  # a fault of this program, too, costs one clip and not the batch
-            known = isinstance(error, VggtjaxError | MemoryError)
-            return failed(name, error if known else RuntimeError(f"{type(error).__name__}: {one_line(str(error))}"))
-        finally:
-            self._fetched.drop(name)
-
-
 def reconstruct_on_cluster(
     load: Load,
     sources: Mapping[str, str],
@@ -107,14 +70,17 @@ def reconstruct_on_cluster(
     kept, also by a later run. Every worker calls the pickled `load` once; it returns the model and the fitted rule of
     fusion. All machines see `sources` (paths or URLs, by name) and `out`. `note` gets a line for the first worker.
 
-    Raises MissingExtraError without Ray; ClusterError where the cluster is not there, has no room for a worker, or runs
-    other code; InputError for an invalid option, or results of other settings; OutputError.
+    Raises MissingExtraError without Ray, and for URLs without fsspec; ClusterError where the cluster is not there, has
+    no room for a worker, or runs other code; InputError for an invalid option, or results of other settings;
+    OutputError.
     """
     check_extra("--engine ray", "cluster", "ray")
+    urls = [url for url in (*sources.values(), str(out)) if is_url(url)]
+    if urls:
+        check_extra("a clip or a folder at a URL", "remote", "fsspec")
+    if (inside := next(filter(is_in_process, urls), None)) is not None:
+        raise InputError(f"{inside} is in the memory of one process; expected a place that all workers reach")
     place = destination(out)
-    for url in (*sources.values(), *([place.url] if isinstance(place, RemoteFolder) else [])):
-        if is_url(url) and is_in_process(url):
-            raise InputError(f"{url} is in the memory of one process; expected a place that all workers reach")
     if isinstance(place, LocalFolder):
         place = LocalFolder(place.path.absolute())
     odd = {name: outcome for name in sources if (outcome := invalid_name(name)) is not None}
@@ -129,7 +95,7 @@ def reconstruct_on_cluster(
 def _computed(
     load: Load, sources: Mapping[str, str], out: Destination, cluster: Cluster, recipe: BatchRecipe, note: Note
 ) -> Generator[ClipOutcome]:
-    """Give each worker that is ready a clip, until every clip has an outcome."""
+    """Give each worker that is ready a clip, until every clip has an outcome; the cluster takes back idle workers."""
     _connect(cluster.address)
     import ray
     from ray.exceptions import RayError, RayTaskError
@@ -141,8 +107,8 @@ def _computed(
         given = load, recipe, out, os.getcwd(), None if gpus else cluster.worker_cpus  # noqa: PTH109 - text
         remote: Any = ray.remote(Worker)
         actor = remote.options(num_cpus=cpus, num_gpus=gpus, max_restarts=-1, max_task_retries=1)
-        workers = [actor.remote(*given) for _ in range(min(count, len(sources)))]
-        calls: dict[Any, tuple[Any, str | None]] = {worker.ready.remote(): (worker, None) for worker in workers}
+        new = (actor.remote(*given) for _ in range(min(count, len(sources))))
+        calls: dict[Any, tuple[Any, str | None]] = {worker.ready.remote(): (worker, None) for worker in new}
         waiting, left, first = iter(sources.items()), len(sources), None
         while left:
             done, _ = ray.wait(list(calls), timeout=_PATIENCE)
@@ -153,11 +119,14 @@ def _computed(
                 try:
                     answer = ray.get(call)
                 except RayError as problem:  # the worker's process ended twice, or never began
-                    if name is None:
-                        cause = problem.cause if isinstance(problem, RayTaskError) else None
-                        words = cause if isinstance(cause, VggtjaxError) else _short(problem)
-                        raise ClusterError(f"a worker cannot begin: {words}") from problem
-                    answer = failed(name, ClusterError(f"two workers ended with it in their work: {_short(problem)}"))
+                    said = _short(problem)
+                    if name is not None:
+                        answer = failed(name, ClusterError(f"two workers ended with it in their work: {said}"))
+                    elif calls and not isinstance(problem, RayTaskError):  # the others go on
+                        note(f"a worker ended before it was ready: {said}")
+                        continue
+                    else:
+                        raise ClusterError(f"a worker cannot begin: {said}") from problem
                 if isinstance(answer, ClipOutcome):
                     left -= 1
                     yield answer
@@ -165,6 +134,7 @@ def _computed(
                     first = _checked(answer, first, out, note)
                 if (clip := next(waiting, None)) is not None:
                     calls[worker.run.remote(*clip)] = worker, clip[0]
+                del worker  # without a handle Ray ends it
     finally:
         ray.shutdown()
 
@@ -222,6 +192,8 @@ def shared(nodes: Sequence[Mapping[str, float]], cluster: Cluster, devices: int 
 
 
 def _short(problem: Exception) -> str:
-    """Return the end of what Ray says, without the stack."""
+    """Return the end of what Ray says, without the stack; or the sentence of an error of ours that it tells."""
+    if isinstance(cause := getattr(problem, "cause", None), VggtjaxError):
+        return str(cause)
     lines = [line.strip() for line in str(problem).splitlines() if line.strip()]
     return one_line(lines[-1] if lines else type(problem).__name__, 200)

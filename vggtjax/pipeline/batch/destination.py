@@ -16,7 +16,7 @@ from typing import Any, TypeAlias
 
 from vggtjax.clips.fingerprint import fingerprint
 from vggtjax.clips.sources import ClipSource, open_source
-from vggtjax.errors import InputError, one_line
+from vggtjax.errors import InputError, VggtjaxError, one_line
 from vggtjax.pipeline.batch.shards import SETTLING, Shard, running
 from vggtjax.results.archive import ARCHIVE_NAME, is_result, source_fingerprint
 from vggtjax.results.disk import announce
@@ -25,7 +25,6 @@ from vggtjax.storage.remote import check_url, exists, is_url, list_url, local_pa
 from vggtjax.storage.writing import check_free, locked_folder, remove_leftovers, staging, writing
 
 SETTINGS_NAME, PAGE_NAME = "batch.json", "index.html"
-CHANGED = "its source has changed since the earlier result"
 _AT_ONCE = 16  # questions to a server
 _MOST_SETTINGS_BYTES = 2**20
 _MOST_NAMED = 8  # settings in a message
@@ -150,10 +149,9 @@ Destination: TypeAlias = LocalFolder | RemoteFolder
 
 def has_changed(place: Destination, name: str, source: ClipSource) -> bool:
     """Return whether the source of a clip is known to be another one than that of its result."""
-    if (of_result := place.source_of(name)) is None:
-        return False
-    with suppress(InputError, OSError):  # a source that is gone or at a URL: its result is kept
-        return fingerprint(open_source(source)) != of_result
+    of_result = place.source_of(name)
+    with suppress(VggtjaxError, OSError):  # a source that is gone or at a URL: its result is kept
+        return of_result is not None and fingerprint(open_source(source, undistort=None)) not in (None, of_result)
     return False
 
 

@@ -19,7 +19,7 @@ from vggtjax.method.fusion.file import check_kept
 from vggtjax.network.checkpoint import Model
 from vggtjax.pipeline.batch.clip_work import ClipWork, LongClip
 from vggtjax.pipeline.batch.contact import contact_page
-from vggtjax.pipeline.batch.destination import CHANGED, Destination, destination, has_changed
+from vggtjax.pipeline.batch.destination import Destination, destination, has_changed
 from vggtjax.pipeline.batch.recipe import BatchRecipe, ClipOutcome, counted, failed, invalid_name
 from vggtjax.pipeline.batch.shards import parse_shard
 from vggtjax.progress import Progress, StageSeconds, no_progress
@@ -42,10 +42,10 @@ def reconstruct_many(
 
     Clips of one shape share compiled programs. A clip that fails, also for a name that is not a plain file name, does
     not stop the others. A later run with the same settings keeps finished clips, so an interrupted run resumes; it does
-    those again whose arrays, or files by their names, sizes, first and last bytes, have changed. A
-    clip's folder appears whole or not at all. A clip that does not fit in memory is run in windows, as by
-    `reconstruct_long`, unless an option needs all frames at once; it then fails before it is read. index.html
-    shows the clips finished so far, and why others failed.
+    those again whose arrays, or files by their names, sizes, first and last bytes, have changed; of a capture the
+    pictures alone count. A clip's folder appears whole or not at all. A clip that does not fit in memory is run in
+    windows, as by `reconstruct_long`, unless an option needs all frames at once; it then fails before it is read.
+    index.html shows the clips finished so far, and why others failed.
 
     Args:
         model: what `load_model` returned.
@@ -96,13 +96,14 @@ def _outcomes(
     """Yield the outcomes of clips that cannot have a folder, then of kept ones, then of the others."""
     odd = {name: outcome for name in sources if (outcome := invalid_name(name)) is not None}
     yield from odd.values()
-    there = place.finished(name for name in sources if name not in odd)
-    changed = {name for name in there if has_changed(place, name, sources[name])}
-    yield from (ClipOutcome(name, "kept") for name in sources if name in there - changed)
-    left = {name: source for name, source in sources.items() if name not in odd and name not in there - changed}
+    there, left = place.finished(name for name in sources if name not in odd), dict[str, ClipSource]()
+    for name in sources:
+        if name in there and not has_changed(place, name, sources[name]):
+            yield ClipOutcome(name, "kept")
+        elif name not in odd:
+            left[name] = sources[name]
     for outcome in counted(_reconstruct_all(work, left), len(left), progress):
-        again = outcome.name in changed and outcome.status == "done"
-        yield outcome._replace(reason=f"{CHANGED}; {outcome.reason}".rstrip("; ")) if again else outcome
+        yield outcome.of_changed() if outcome.name in there else outcome
 
 
 def _reconstruct_all(work: ClipWork, sources: Mapping[str, ClipSource]) -> Generator[ClipOutcome]:

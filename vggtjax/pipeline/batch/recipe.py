@@ -24,6 +24,7 @@ from vggtjax.progress import Progress
 from vggtjax.results.saving import Saving
 from vggtjax.storage.file_digest import file_digest
 
+CHANGED = "its source has changed since the earlier result"
 _TAKEN = ("", "..", SETTINGS_NAME, PAGE_NAME)
 
 # By the name of a clip: an array, a folder of pictures, or False where nothing moves; or the folder of such folders.
@@ -36,8 +37,12 @@ class ClipOutcome(NamedTuple):
 
     name: str
     status: Literal["done", "kept", "failed"]  # kept: an earlier run has finished it
-    reason: str = ""  # of a failure, or of windows
+    reason: str = ""  # of a failure, of windows, or of doing it again
     frames: int = 0
+
+    def of_changed(self) -> ClipOutcome:
+        """Return the outcome of a clip that was done again as its source has changed."""
+        return self._replace(reason=f"{CHANGED}; {self.reason}".rstrip("; ")) if self.status == "done" else self
 
 
 @dataclass(frozen=True)

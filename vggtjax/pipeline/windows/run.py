@@ -20,7 +20,7 @@ from jaxtyping import Array, Float32, UInt8
 
 from vggtjax.clips.captures.frames import CaptureFrames
 from vggtjax.clips.clip import Clip
-from vggtjax.clips.fingerprint import fingerprint
+from vggtjax.clips.fingerprint import source_setting
 from vggtjax.clips.masks import load_masks, masks_digest
 from vggtjax.clips.media.sampling import Sampling
 from vggtjax.clips.preprocessing import Fitter, Framing
@@ -163,7 +163,7 @@ def tools_of(
 
     def run(clip: Clip) -> Reconstruction:
         moving = load_masks(str(masks), clip) if isinstance(masks, str | Path) else masks
-        running = Running(keep_mask=True)
+        running = Running(is_part=True)
         return reconstruct(model, clip, options=options, running=running, size=size, masks=moving, fusion=fusion)
 
     execute, compute = Execute(), compute_by(options)
@@ -217,12 +217,16 @@ def run_windows(
         raise InputError(f"the clip has {frames} frames and window is {windows.window}; expected a longer clip")
     assert windows.window is not None
     cut = plan_windows(frames, windows.window, windows.shared)
-    decides = settings | {
-        "sampling": dataclasses.asdict(plan.sampling),
-        "fitter": dataclasses.asdict(plan.fitter),
-        "windows": [frames, windows.window, windows.shared],
-        "source": fingerprint(opened),
-    }
+    known = source_setting(opened)
+    decides = (
+        settings
+        | known
+        | {
+            "sampling": dataclasses.asdict(plan.sampling),
+            "fitter": dataclasses.asdict(plan.fitter),
+            "windows": [frames, windows.window, windows.shared],
+        }
+    )
     if isinstance(opened, CaptureFrames) and opened.lenses_undone:
         decides["undistorted"] = opened.lenses_undone
     clips = window_clips(opened, plan.sampling, plan.fitter, cut)
@@ -269,6 +273,7 @@ def run_windows(
 
         result = agree_with_pixels(result, pictures, Options(consistent_depth=consistent), on_stage=stage)
         result = without_mask(result)
+        result = dataclasses.replace(result, settings=result.settings | known)
         with plan.on_stage("write") as progress:
             shown = pictures() if plan.saving.resolution == "original" else None
             facts = RunFacts(seconds.seconds)
