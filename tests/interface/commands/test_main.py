@@ -160,7 +160,7 @@ def test_reconstruct_with_masks_and_tracks_of_ones_own(tmp_path, capsys, frames)
     still = Reconstruction.load(tmp_path / "still")
     assert not still.dynamic_mask.any()
     assert still.settings["refine_mask"] is False
-    assert "consistent_depth" not in still.settings
+    assert still.settings["consistent_depth"] is False
 
 
 @pytest.mark.parametrize(
