@@ -51,8 +51,8 @@ class Cue:
 class MotionConfig:
     """The cues, and the frames that each cue is averaged over, as offsets from the reference frame.
 
-    The cues become a saliency in `method.cues`. The score of motion by matches (`method.matched_motion`) reads of these
-    values `matching` alone.
+    The cues become a saliency in `method.cues`. The score of motion by matches (`method.matching`) reads
+    `matching` alone of these values.
 
     `floor` is added to every map, inverted or not, before the product: 0 in the papers. Each map is 0 at some patch of
     every frame. Without a floor the product is 0 there, whatever the other maps say, which matters where a frame has

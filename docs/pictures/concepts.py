@@ -79,7 +79,8 @@ def made_of() -> str:
     """Return a digest of all that the pictures are made of."""
     import vggtjax
 
-    digest, embedded = hashlib.sha256(vggtjax.__version__.encode()), Path(vggtjax.__file__).parent / "pipeline/pretrained"
+    digest = hashlib.sha256(vggtjax.__version__.encode())
+    embedded = Path(vggtjax.__file__).parent / "pipeline/pretrained"
     code = (Path(__file__), Path(__file__).with_name("consistency.py"))
     for path in (*code, embedded / "model.safetensors", embedded / "clip.npz"):
         digest.update(path.read_bytes())

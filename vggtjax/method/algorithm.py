@@ -1,4 +1,4 @@
-"""4DVGGT-D (arXiv 2605.12027) on one page: all that reconstructs clips calls these two functions.
+"""4DVGGT-D (arXiv 2605.12027) on one page: all that reconstructs clips calls `run_method` or `run_passes`.
 
 backbone features -> first pass, with motion cues -> dynamic mask -> second pass, with its keys suppressed
 -> surgery and fusion
@@ -36,7 +36,7 @@ from vggtjax.options import Options
 Images = Float[Array, "B S H W 3"]
 Masks = Bool[Array | np.ndarray, "B S H W"] | Float[Array | np.ndarray, "B S H W"] | SoftMasking | Literal[False] | None
 FIRST_OUTPUTS = ("camera", "depth")
-_CLIPS = ClipBatch(BY_FRAME, BY_FRAME, REPLICATED)  # type: ignore[arg-type]
+_CLIPS = ClipBatch(BY_FRAME, BY_FRAME, REPLICATED)  # type: ignore[arg-type] # where its parts are on several devices
 _Parameters = ParamSpec("_Parameters")
 _Result = TypeVar("_Result")
 
@@ -91,7 +91,7 @@ class Clips:
         return Frames(frames.mesh, None if self.counted == self.images.shape[1] else self.counted)
 
     def padding(self, frames: Frames) -> Int[Array, " B"] | None:
-        """Return the number of real frames of each clip where `frames` of the passes has more; it is traced."""
+        """Return the number of real frames of each clip, to be traced; None where `frames` of the passes has it."""
         B, S = self.images.shape[:2]
         passed = S if frames.mesh is None or frames.count is None else frames.count
         return None if self.counted == passed else np.full(B, self.counted, np.int32)  # type: ignore[return-value]
@@ -140,8 +140,9 @@ def run_method(
         clips: images, or `Clips`.
         config: the model's configuration.
         options: the method and its settings; masks are not refined, as that is done on the host.
-        masks: what moves: boolean or shares in [0, 1]; False: nothing; `SoftMasking`: mined with gradients; None:
-            mined by the options. Mined and soft masks are empty in clips whose frames are all one picture.
+        masks: what moves: boolean or shares in [0, 1]; False: nothing; `SoftMasking`: mined with gradients, cut by
+            the model's threshold; None: mined by the options. Mined and soft masks are empty in clips whose frames are
+            all one picture.
         fusion: a rule of fusion in place of the paper's, as for `assemble`.
         both_outputs: predict depth in the second pass even if the method does not read it.
         compute: how the network is computed; by the options and the platform if None.

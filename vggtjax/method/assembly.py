@@ -69,8 +69,8 @@ def assemble(
 
     Args:
         passes: of `run_passes` with this method's options; passes of another method give a wrong result, not an error.
-        fusion: a rule of fusion in place of the paper's: a fitted tree, or a function of
-            `fusion_family.Observations` that returns depth and precision, of the same shape. The precision becomes the
+        fusion: a rule of fusion in place of the paper's: a fitted tree, or a function of `Observations` (of
+            `method.fusion.family`) that returns depth and precision, of the same shape. The precision becomes the
             confidence.
         method: a name of `METHODS`.
         align_scale: scale the second pass (depth and camera translations) by the median depth ratio over static
@@ -86,10 +86,11 @@ def assemble(
     scale = None
     if align_scale and passes.second is not None:
         scale = scale_between(present(first.depth), present(second.depth), passes.dynamic_mask)
-    depth, confidence = _depth(passes, row.depth, scale)
     if fusion is None and row.depth == "fused" and passes.dynamic_mask.dtype != bool:
-        fusion = paper_rule()  # the same rule, which blends by shares
-    if fusion is not None:
+        fusion = paper_rule()  # of `fuse_depth`, written for shares
+    if fusion is None:
+        depth, confidence = _depth(passes, row.depth, scale)
+    else:
         depth, confidence = _by_rule(fusion, observe(passes, scale=scale))
     size = (depth.shape[2], depth.shape[3])
     extrinsics, intrinsics = decode_pose(present(second.pose_encoding), size)

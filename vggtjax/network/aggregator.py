@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vggtjax.config import Suppress, VGGTConfig
 from vggtjax.errors import InputError
-from vggtjax.network.block import Block, StoredBlock, stored
+from vggtjax.network.block import Block, PackedBlock, activations
 from vggtjax.network.kernels.captured import Capture, joined, nothing_captured
 from vggtjax.network.kernels.frames import Frames
 from vggtjax.network.kernels.in_place import replaced_if
@@ -81,11 +81,11 @@ class PairInputs(NamedTuple):
     suppression: Bool[Array, ""] | Float[Array, ""]  # whether it suppresses keys, or how far
     is_tapped: Bool[Array, " taps"]
     counts: Int[Array, ...] | None  # how often the accumulator reads it
-    is_early: Bool[Array, ""] | None  # whether global attention sees the own frame alone; None: never
+    is_early: Bool[Array, ""] | None  # whether global attention is within the frame, too; None: never
 
 
 class Pair(nn.Module):
-    """A frame block, in which tokens attend to those of their frame, and a global block, to those of all frames.
+    """A frame block, in which tokens attend to those of their frame, and a global block, in which they attend to all.
 
     Attributes:
         frame_block, global_block: the two blocks.
@@ -125,10 +125,11 @@ class Pair(nn.Module):
 
         if self.accumulator is not None:
             q, k = (a.reshape(B, S, T, *a.shape[2:]) for a in (q, k))
-            x, (q, k) = frames.in_order(x, (q, k))  # in the gradient, cues communicate before attention does
-            counts = frames.after(inputs.counts, x)  # and here, after it
+            # Devices that share the frames communicate for attention first, then for cues; in the gradient, cues first.
+            x, (q, k) = frames.in_order(x, (q, k))
+            counts = frames.after(inputs.counts, x)
             sums = self.accumulator.add(sums, counts, q, k, self.frame_count)
-        taps = tuple(
+        taps = tuple(  # each is changed in its pair alone
             jax.named_scope(f"tap{i}")(replaced_if)(inputs.is_tapped[i], tap, joined(capture, self.shape), frame, x)
             for i, (capture, tap) in enumerate(zip(self.captures, carry.taps, strict=True))
         )
@@ -163,25 +164,25 @@ class Aggregator(nn.Module):
         Args:
             patch_tokens: what `encode` returned.
             grid: rows and columns of patches, h and w.
-            captures: one function per entry of `config.taps`, from tokens [B, S, T, 2C] to any tree of arrays. Only
-                these trees are stored, and only of the tapped pairs.
+            captures: one function per entry of `config.taps`, from tokens [B, s, T, 2C] of some frames to any tree of
+                arrays [B, s, ...], each frame by itself. Only these trees are stored, and only of the tapped pairs.
             accumulator: what to sum over q and k of the global blocks, such as motion cues, or None.
             frame_count: number of real frames of each clip, at least one; padded frames follow and do not change them.
             suppression: the keys to suppress, in both blocks of a pair.
             compute: type of the products; how global attention is computed; with `remat`, only the input of every pair
-                is stored for the gradient; where the frames are: global attention gathers keys and values, all else is
-                local.
+                is stored for the gradient; where the frames are: global attention gathers keys and values, and cues
+                what they need of other frames; all else is local.
         """
         config, frames = self.config, compute.frames
         B, S, P, C = patch_tokens.shape
         T = SPECIAL_TOKENS + P
         real = frames.are_real(frame_count, B, S)
-        if real is not None:  # 0 x NaN is NaN: padded frames are set to 0
+        if real is not None:  # attention weighs padded values by 0, and 0 x NaN is NaN
             patch_tokens = jnp.where(real[:, :, None, None], patch_tokens, 0)
         tokens = self._tokens(upcast(patch_tokens), frames)
 
-        block = partial(StoredBlock, config.num_heads, qk_norm=True, dtype=jnp.dtype(compute.compute_dtype))
-        pairs = over_layers(Pair, config.depth, store=stored(remat=compute.remat))(
+        block = partial(PackedBlock, config.num_heads, qk_norm=True, dtype=jnp.dtype(compute.compute_dtype))
+        pairs = over_layers(Pair, config.depth, store=activations(remat=compute.remat))(
             block(name="frame_blocks"),
             block(name="global_blocks"),
             shape=(B, S, T, C),
@@ -221,7 +222,10 @@ class Aggregator(nn.Module):
 
 
 def _global_attention(compute: Compute, S: int, grid: tuple[int, int]) -> Attend:
-    """Return attention over S frames of a clip, or over those of all devices. Raises InputError for approximations."""
+    """Return attention over S frames of a clip, or over all frames of several devices.
+
+    Raises InputError for an approximation on several devices.
+    """
     if compute.frames.mesh is None:
         attend = compute.attention if callable(compute.attention) else GLOBAL_ATTENTION[compute.attention]
         return attend(S, grid, SPECIAL_TOKENS)

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
-from vggtjax.network.block import BlockLayer, StoredBlock, stored
+from vggtjax.network.block import BlockLayer, PackedBlock, activations
 from vggtjax.network.given import as_images, check_floats
 from vggtjax.network.layers import TABLE, Conv, LayerNorm, Params, over_layers
 from vggtjax.network.precision import check_compute_dtype, full_precision, upcast
@@ -84,8 +84,8 @@ class Backbone(nn.Module):
         registers = self.param("register_tokens", TABLE, (REGISTERS, C))
         special = jnp.concatenate([class_token + positions[:1], registers]).astype(x.dtype)  # [1 + R, C]
         x = jnp.concatenate([jnp.broadcast_to(special, (B * S, *special.shape)), x], axis=1)  # [B*S, 1 + R + P, C]
-        block = StoredBlock(config.dino_num_heads, epsilon=_EPSILON, dtype=dtype, layer_scale=1.0, name="blocks")
-        x, _ = over_layers(BlockLayer, config.dino_depth, store=stored(remat=self.remat))(block)(x)
+        block = PackedBlock(config.dino_num_heads, epsilon=_EPSILON, dtype=dtype, layer_scale=1.0, name="blocks")
+        x, _ = over_layers(BlockLayer, config.dino_depth, store=activations(remat=self.remat))(block)(x)
         x = LayerNorm(_EPSILON, name="norm")(x)
         return x[:, 1 + REGISTERS :].reshape(B, S, grid[0] * grid[1], C)
 

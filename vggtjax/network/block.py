@@ -22,10 +22,11 @@ _STORED = jax.checkpoint_policies.save_from_both_policies(
 )
 
 
-def stored(*, remat: bool) -> Callable[..., Any]:
-    """Return what a loop over blocks stores for its gradient, beside the input of every block.
+def activations(*, remat: bool) -> Callable[..., Any]:
+    """Return the policy by which a loop over blocks stores activations for its gradient, beside its carry.
 
-    It is the outputs of linear layers and of attention, as all else is cheap to compute again; with `remat`, nothing.
+    They are the outputs of linear layers and, on a CPU, of attention, as all else is cheap to compute again; with
+    `remat`, none.
     """
     return jax.checkpoint_policies.nothing_saveable if remat else _STORED
 
@@ -45,7 +46,10 @@ class Projections(nn.Module):
             self.q_norm, self.k_norm = LayerNorm(dtype=self.dtype), LayerNorm(dtype=self.dtype)
 
     def heads(self, x: Float[Array, "R C"], rope: Rope | None, count: int) -> tuple[Array, Array, Array]:
-        """Return q, k and v [count, N, D] of the first rows; q and k after norm, and rotated by their rows' angles."""
+        """Return q, k and v [count, N, D]; q and k after norm, and rotated by their rows' angles.
+
+        Rows from `count` on only pad the product.
+        """
         y = self.qkv(x).reshape(-1, 3, self.num_heads, self.channels // self.num_heads)
         q, k, v = (y[:count, i] for i in range(3))
         if self.qk_norm:
@@ -85,7 +89,7 @@ class Block(nn.Module):
         Args:
             x: B sequences of L tokens.
             rope: the angles of T tokens, where L is a multiple of T; or None.
-            attend: attention of each sequence, from q, k and v to what is projected.
+            attend: attention within each sequence, from q, k and v [B, L, N, D] to the averaged values.
         """
         B, L, C = x.shape
         projections = Projections(self.num_heads, C, self.qk_norm, self.dtype, name="attention")
@@ -112,8 +116,8 @@ class Block(nn.Module):
         return map_chunks_in_place(after, tokens, y).reshape(B, L, C), q, k
 
 
-# A block whose kernels may be stored in another form, as in 8 bits: one layer at a time is turned back.
-StoredBlock: Any = nn.map_variables(Block, "params", as_multiplied, init=True)
+# A block whose kernels may be kept in 8 bits or as bits of bfloat16: those of one layer at a time become floats.
+PackedBlock: Any = nn.map_variables(Block, "params", as_multiplied, init=True)
 
 
 class BlockLayer(nn.Module):

@@ -47,17 +47,20 @@ class Start(struct.PyTreeNode, AxisMetadata[Any]):
 
 
 def constant(mean: Mean) -> nn.initializers.Initializer:
-    """Return an initialiser of a parameter that starts at one value, or at one of every channel."""
+    """Declare a parameter that starts at one value, or at one of every channel.
+
+    The value is in the `Start`; what flax's own `init` makes of it are zeros, here and below.
+    """
     return lambda key, shape, dtype=jnp.float32: Start(jnp.zeros(shape, dtype), mean, 0.0)
 
 
 def normal(spread: float) -> nn.initializers.Initializer:
-    """Return an initialiser of a parameter that starts with a normal distribution around 0."""
+    """Declare a parameter that starts with a normal distribution around 0."""
     return lambda key, shape, dtype=jnp.float32: Start(jnp.zeros(shape, dtype), 0.0, spread)
 
 
 def by_fan_in(gain: float = 1.0) -> nn.initializers.Initializer:
-    """Return an initialiser of a kernel whose outputs have the variance of its inputs, times the squared gain."""
+    """Declare a kernel whose outputs have the variance of its inputs, times the squared gain."""
     return lambda key, shape, dtype=jnp.float32: normal(gain * np.prod(shape[:-1]) ** -0.5)(key, shape, dtype)
 
 
@@ -65,7 +68,7 @@ ZEROS, ONES, TABLE = constant(0.0), constant(1.0), normal(0.02)
 
 
 class Dense(nn.Module):
-    """A linear layer. Products in bfloat16 have outputs in float32."""
+    """A linear layer. Outputs of products in bfloat16 have the type float32, but a CPU alone gives them its digits."""
 
     features: int
     dtype: DType = None  # of the product; None: the wider type of inputs and parameters
@@ -95,7 +98,7 @@ class Dense(nn.Module):
 
 
 class Conv(nn.Conv):
-    """A convolution."""
+    """flax's convolution, which starts by its fan-in."""
 
     kernel_init: Any = by_fan_in()
     bias_init: Any = ZEROS
@@ -134,7 +137,7 @@ class MLP(nn.Module):
 
 @jax.custom_vjp
 def gelu(x: Array) -> Array:
-    """Return x times the normal distribution function of x; the gradient computes both again from x."""
+    """Return x times the normal distribution function of x; the gradient computes that again from x."""
     return x * _normal_cdf(x)
 
 
@@ -153,7 +156,7 @@ gelu.defvjp(lambda x: (gelu(x), x), _gelu_backward)
 
 @jax.custom_vjp
 def _fused_gelu(x: Array) -> Array:
-    """Return GELU by tanh, off by at most 5e-4: cuBLAS applies it as it writes a product."""
+    """Return GELU by tanh, off by at most 5e-4, with the exact one's gradient: cuBLAS applies it as it writes."""
     return jax.nn.gelu(x, approximate=True)
 
 
@@ -165,10 +168,10 @@ def _unchanged(x: Array) -> Array:
 
 
 def over_layers(layer: type[nn.Module], depth: int, *, store: Any = None) -> Any:
-    """Return a module that runs `depth` equal layers, (carry, inputs) -> (carry, None), in a loop.
+    """Return a class of modules that run `depth` equal layers, (carry, inputs) -> (carry, None), in a loop.
 
-    Its parameters are those of one layer with an axis of layers in front, and so are its inputs. With `store` it is a
-    policy of `jax.checkpoint`: what is stored for the gradient.
+    Parameters and inputs have an axis of layers in front. `store` is a policy of `jax.checkpoint`: which activations of
+    a layer are stored for the gradient; None: all.
     """
     step: Any = layer if store is None else nn.remat(layer, prevent_cse=False, policy=store)
     loop = {"variable_axes": {"params": 0}, "split_rngs": {"params": True}, "length": depth}

@@ -30,8 +30,8 @@ class Compute:
         remat: compute activations of blocks and dense heads again in the backward pass: less memory, more time.
         stop_camera_gradient: treat the previous estimate as a constant in every iteration of the camera head, as in
             VGGT's training.
-        attention: how global attention is computed: "exact", "sampled" (an approximation, see `network.sampled`), or a
-            function (S, grid, special tokens) -> attention, as an experiment.
+        attention: how global attention is computed: "exact", "sampled" (an approximation, see
+            `network.kernels.sampled`), or a function (S, grid, special tokens) -> attention, as an experiment.
         frames: where the frames of the clips are; all here by default, else the call is inside `Frames.on_devices`.
     """
 

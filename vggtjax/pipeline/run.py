@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -79,7 +79,7 @@ def reconstruct(
         masks: dynamic regions, instead of the mined masks: boolean at the size of the clip's frames, as given or as
             fitted, or of the source's images, or a folder of images; False: nothing is dynamic. If no pixel is dynamic,
             the second pass is skipped. It is also skipped if masks are mined and all frames are identical.
-        tracks: points to follow, in pixels of the frames; points of a later frame than the first cost one more pass.
+        tracks: points to follow, in pixels of the frames; each frame after the first with points costs a pass.
         fusion: a fitted rule (`load_fusion`) or a function, as for `assemble`, whose precision is the confidence; None:
             the paper's rule.
         known: intrinsics, poses or lengths that are known, and pixels without depth: the prediction is brought to them.
@@ -111,7 +111,7 @@ def reconstruct(
         started = time.perf_counter()
         with running.stage("compile programs") as progress:
             compiler = Compile()
-            run(step=compiler)
+            run(step=compiler)  # its steps take and return shapes
             compiler.wait(progress)
         hint_compilation_cache(time.perf_counter() - started)
         outputs = _on_host(run(step=Execute(running.stage)), len(inputs.clip.images))
@@ -179,9 +179,9 @@ def compile_ahead(
 
 
 def refined(result: Reconstruction, progress: Progress | None, unit: float = 1.0) -> Reconstruction:
-    """Return the result without the mask's pixels that agree with other frames, by the result's depth and cameras.
+    """Return the result with a mask without the pixels that agree with other frames, by its depth and cameras.
 
-    `unit` is the length of the network's unit in the result's.
+    `unit` is how long the network's unit is in units of the result.
     """
     own = result if unit == 1 else scaled(result, 1 / unit)
     images, cameras = result.images / np.float32(255), (own.camera_from_world, own.intrinsics)
@@ -225,6 +225,9 @@ def _arguments(
     if mesh is not None:
         params, rule = replicate((params, rule), mesh)
     mines = options.row.makes_mask or agrees_with_pixels(options) or running.keep_passes or running.is_part
+    moving: Array | Literal[False] | None = None if mines else False
+    if masks is not None:
+        moving = padded(masks) if masks.any() else False
     return {
         "params": params,
         "clips": Clips(
@@ -234,7 +237,7 @@ def _arguments(
         ),
         "config": model.config,
         "options": options,
-        "masks": (None if mines else False) if masks is None else padded(masks) if masks.any() else False,
+        "masks": moving,
         "fusion": rule,
         "both_outputs": running.keep_passes,
         "compute": compute_by(options, Frames(mesh, None if mesh is None else length)),
@@ -280,7 +283,7 @@ def _result(
 def _with_geometry(
     result: Reconstruction, inputs: Inputs, options: Options, on_stage: OnStage
 ) -> tuple[Reconstruction, float]:
-    """Return the result by pixels and by what is known, and how long the prediction's unit is in its own."""
+    """Return the result by pixels and by what is known, and how long the network's unit is in units of the result."""
     geometry = inputs.geometry
 
     def agree(result: Reconstruction) -> Reconstruction:

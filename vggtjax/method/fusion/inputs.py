@@ -1,4 +1,4 @@
-"""Two passes over a clip -> the inputs of a fusion rule, `Observations` (declared in `fusion_family`)."""
+"""Two passes over a clip -> the inputs of a fusion rule, `Observations` (declared in `method.fusion.family`)."""
 
 from __future__ import annotations
 

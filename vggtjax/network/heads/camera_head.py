@@ -10,7 +10,7 @@ from flax import linen as nn
 from jaxtyping import Array, Float, Int
 
 from vggtjax.config import VGGTConfig
-from vggtjax.network.block import BlockLayer, StoredBlock
+from vggtjax.network.block import BlockLayer, PackedBlock
 from vggtjax.network.heads.pose import POSE_SIZE
 from vggtjax.network.kernels.attention import attention
 from vggtjax.network.kernels.frames import Frames
@@ -73,7 +73,7 @@ class CameraHead(nn.Module):
         empty = jnp.broadcast_to(empty, (*tokens.shape[:2], POSE_SIZE)).astype(tokens.dtype)
         embed, modulate = Dense(E, name="pose_embedding"), Dense(3 * E, name="modulation")
         dtype = jnp.dtype(self.compute_dtype or camera_tokens.dtype)
-        block = StoredBlock(config.camera_num_heads, dtype=dtype, name="trunk")
+        block = PackedBlock(config.camera_num_heads, dtype=dtype, name="trunk")
         trunk = over_layers(BlockLayer, config.camera_depth)(block, partial(attention, visible=is_real))
         norm = LayerNorm(name="trunk_norm")
         start = tuple(number / ITERATIONS for number in (0, 0, 0, 0, 0, 0, 1, 1, 1))  # every iteration adds it
