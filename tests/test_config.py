@@ -8,13 +8,8 @@ import sys
 import pytest
 
 from vggtjax import VGGTConfig
-from vggtjax.config import MotionConfig, vggt_1b
+from vggtjax.config import MotionConfig
 from vggtjax.errors import InputError
-
-
-def test_defaults_are_vggt_1b():
-    assert VGGTConfig() == vggt_1b()
-    assert (VGGTConfig().tap_dim, VGGTConfig().grid_size) == (2048, 37)
 
 
 @pytest.mark.parametrize(

@@ -48,10 +48,8 @@ def test_the_passes_depend_on_all_options_but_those_of_the_assembly():
     assert Options("4dvggt-m", mask="gram").passes_settings(MOTION) == key
     assert "attention" not in Options().to_json()
     assert all(Options(**{name: value}).passes_settings(MOTION) != key for name, value in other.items())
-    assert (
-        Options(align_scale=True, refine_mask=True, refine_cameras=True, consistent_depth=True).passes_settings(MOTION)
-        == key
-    )
+    exact = Options(align_scale=True, refine_mask=True, refine_cameras=True, consistent_depth=True)
+    assert exact.passes_settings(MOTION) == key
     same = {name for name in METHODS if Options(name).passes_settings(MOTION) == key}  # pyright: ignore[reportArgumentType]
     assert same == set(METHODS) - {"vggt4d", "4dvggt-m"}
 

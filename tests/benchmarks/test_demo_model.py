@@ -5,20 +5,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from benchmarks import __main__ as benchmarks
 from benchmarks import demo_model
-from benchmarks.blind_guesses import (
-    Prior,
-    compare,
-    guesses,
-    mean_depth_map,
-)
+from benchmarks.blind_guesses import Prior, compare, guesses, mean_depth_map
 from benchmarks.real_clips import load_windows, window_starts
 from benchmarks.summaries import comparison_table
 from tests.benchmarks.scenes import SIDE, drawn_scenes, row, tiny_file
+from tests.shared.dataset_files import write_plain
 from tests.shared.tiny import tiny_config
 from vggtjax.clips.truth import Truth
 from vggtjax.errors import InputError
@@ -27,24 +22,19 @@ FRAMES = 3
 
 
 def write_clip(folder, frames=FRAMES, jump_at=0) -> None:
-    """A filmed clip as the benchmark expects it: 56 x 56 pixels, depth 1000 + 10 x column millimetres."""
+    """A filmed clip as the benchmark expects it: 56 x 56 pixels, depth 1 + column / 100 metres."""
     generator = np.random.default_rng(0)
     poses = np.tile(np.eye(4), (frames, 1, 1))
     poses[:, :3, :3] = Rotation.from_rotvec(0.1 * np.arange(frames)[:, None] * [0, 1, 0.3]).as_matrix()
     poses[:, :3, 3] = 0.1 * np.arange(frames)[:, None] + 0.03 * generator.normal(size=(frames, 3))
     poses[jump_at:, :3, 3] += 50
-    depth = np.tile(1000 + 10 * np.arange(56, dtype=np.uint16), (56, 1))
-    depth[:8] = 0
-    for name in ("rgb", "depth", "mask"):
-        (folder / name).mkdir(parents=True)
+    depth = np.tile(1 + np.arange(56) / 100, (frames, 56, 1))
+    depth[:, :8] = 0
+    moving = np.zeros((frames, 56, 56), bool)
     for frame in range(frames):
-        moving = np.zeros((56, 56), np.uint8)
-        moving[20:40, 10 + frame : 30 + frame] = 255
-        images = {"rgb": generator.integers(0, 255, (56, 56, 3), np.uint8), "depth": depth, "mask": moving}
-        for name, image in images.items():
-            Image.fromarray(image).save(folder / f"{name}/{frame:05}.png")
-    np.savetxt(folder / "world_from_camera.txt", poses.reshape(frames, 16))
-    np.savetxt(folder / "K.txt", [[50, 0, 28], [0, 50, 28], [0, 0, 1]])
+        moving[frame, 20:40, 10 + frame : 30 + frame] = True
+    images, K = generator.random((frames, 56, 56, 3)), np.array([[50.0, 0, 28], [0, 50, 28], [0, 0, 1]])
+    write_plain(folder, Truth(images, depth, moving, np.linalg.inv(poses)[:, :3], np.tile(K, (frames, 1, 1))))
 
 
 def test_filmed_clips_arrive_at_the_models_pixels(tmp_path):

@@ -10,7 +10,7 @@ from PIL import Image
 
 from vggtjax.clips.media.images import to_rgb
 from vggtjax.clips.media.sampling import Frame
-from vggtjax.clips.preprocessing import Fit, Fitter
+from vggtjax.clips.preprocessing import Fitter
 from vggtjax.errors import ClipError, InputError
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "preprocess.npz"
@@ -23,15 +23,6 @@ def test_pixels_are_those_of_vggt(picture, mode):
         image = to_rgb(Image.fromarray(golden[f"{picture}/input"]), picture)
         expected = golden[f"{picture}/{mode}"].transpose(1, 2, 0)
     np.testing.assert_array_equal(Fitter(mode).fit(*image.size, picture).render(Frame("", image)), expected)
-
-
-def test_crop_makes_the_width_whole_and_cuts_the_height():
-    # 20 x 30 becomes 28 wide and round(30 * 1.4 / 14) * 14 = 42 high, of which the middle 28 stay.
-    fit = Fitter("crop", 28, 14).fit(20, 30, "a")
-    assert fit == Fit((20, 30), (28, 42), 7, (28, 28), (0, 0, 28, 28))
-    assert fit.scale == (20 / 28, 30 / 42)
-    assert fit.offset == (0, 7 * 30 / 42)
-    assert Fitter("crop", 28, 14).fit(40, 20, "a") == Fit((40, 20), (28, 14), 0, (28, 14), (0, 0, 28, 14))
 
 
 def test_pad_puts_the_odd_rest_below():

@@ -9,7 +9,6 @@ from safetensors.numpy import save_file
 from converters import convert, convert_state_dict
 from converters.foreign import FOREIGN, refuse_foreign
 from converters.locate import locate
-from tests.shared.seeded import seeded_state_dict
 from vggtjax.errors import CheckpointError
 
 # Keys as the networks' public code builds them.
@@ -23,11 +22,6 @@ KEYS = {
     "AnySplat": "encoder.aggregator.camera_token",
     "HunyuanWorld-Mirror": "visual_geometry_transformer.camera_token",
 }
-
-
-@pytest.fixture(scope="module")
-def state_dict(golden):
-    return seeded_state_dict(json.loads((golden / "shapes.json").read_text()))
 
 
 @pytest.mark.parametrize("name", KEYS)

@@ -149,10 +149,8 @@ def test_free_memory_is_the_least_of_the_host_and_the_control_groups(tmp_path):
     data = f"Max data size             {2**40}        unlimited            bytes\n"
     space = f"Max address space         {(700000 + 400150) * 1024}            unlimited            bytes\n"
     write("proc/self/limits", title + data + space)
-    assert own_limits(tmp_path) == [
-        ("ulimit -d", 2**40, 300 * 1024),
-        ("ulimit -v", (700000 + 400150) * 1024, 700000 * 1024),
-    ]
+    address = (700000 + 400150) * 1024
+    assert own_limits(tmp_path) == [("ulimit -d", 2**40, 300 * 1024), ("ulimit -v", address, 700000 * 1024)]
     stacks = 300_000_000 / 1024  # of threads that start later
     assert room() == (100 + 200, "of its container (cgroup)", True)
     write("sys/fs/cgroup/c/memory.max", "max")

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from tests.shared.scored_room import room_and_truth
-from tests.shared.tiny import tiny_model
 from vggtjax import load_clip
-from vggtjax.options import METHODS, Options
+from vggtjax.options import Options
 from vggtjax.pipeline.run import reconstruct, with_own_mask
 from vggtjax.pipeline.running import Running
 from vggtjax.pipeline.several import reconstruct_methods
@@ -19,18 +18,9 @@ from vggtjax.results.reconstruction import Reconstruction
 
 
 @pytest.fixture(scope="module")
-def model():
-    return tiny_model()
-
-
-@pytest.fixture(scope="module")
 def clip(model):
     images = np.random.default_rng(3).integers(0, 255, (4, 28, 42, 3), np.uint8)
     return load_clip(images, model=model, size=42)
-
-
-def test_only_the_first_pass_makes_none():
-    assert [name for name, row in METHODS.items() if not row.makes_mask] == ["vggt"]
 
 
 def test_a_result_of_one_pass_has_no_mask_and_the_same_depth_and_cameras(model, clip, tmp_path):

@@ -5,22 +5,10 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from tests.shared.moving_ball import moving_ball
-from tests.shared.tiny import tiny_model
-from vggtjax import load_clip, reconstruct
+from vggtjax import reconstruct
 from vggtjax.pipeline.several import reconstruct_methods
 
 METHODS = ("4dvggt-d", "vggt4d")
-
-
-@pytest.fixture(scope="module")
-def model():
-    return tiny_model()
-
-
-@pytest.fixture(scope="module")
-def clip():
-    return load_clip((255 * np.asarray(moving_ball(3))).astype(np.uint8), size=56)
 
 
 @pytest.mark.filterwarnings("ignore:the field of view")

@@ -126,9 +126,7 @@ class Trial:
             self._note([f"code {ended.code}: {ended.said}"], label)
         self._note(self._wrong(files_below(self.out), ended=False), label)
         for below in self.case.at_once:
-            shutil.rmtree(
-                self.out / below, ignore_errors=True
-            )  # the next run replaces nothing; what is beside it stays
+            shutil.rmtree(self.out / below, ignore_errors=True)  # replaced by no run; what is beside it stays
         again = Run(self.function, self.place, self.out).finish()
         self._note([f"code {again.code}: {again.said}"] if again.code else [], f"{label}, then run again")
         self._end(f"{label}, then run again")

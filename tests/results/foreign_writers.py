@@ -47,12 +47,8 @@ def write_da3(folder, kind="npz", rows=3):
     """Depth Anything 3's exporters npz and mini_npz: camera-from-world, with a last row or without."""
     poses = np.tile(np.eye(4, dtype=np.float32), (3, 1, 1))
     poses[:, :3] = ROOM.camera_from_world
-    arrays = {
-        "depth": ROOM.depth,
-        "conf": ROOM.depth_confidence,
-        "extrinsics": poses[:, :rows],
-        "intrinsics": ROOM.intrinsics,
-    }
+    arrays = {"depth": ROOM.depth, "conf": ROOM.depth_confidence, "intrinsics": ROOM.intrinsics}
+    arrays["extrinsics"] = poses[:, :rows]
     (folder / "exports" / kind).mkdir(parents=True)
     if kind == "npz":
         arrays["image"] = ROOM.images

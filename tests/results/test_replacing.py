@@ -5,7 +5,8 @@ import errno
 import numpy as np
 import pytest
 
-from tests.results.test_export import expected_files, files
+from tests.results.test_export import expected_files
+from tests.shared.contents import contents
 from tests.shared.room import make_room
 from vggtjax.errors import InputError, OutputError
 from vggtjax.results import export
@@ -22,10 +23,10 @@ def test_files_of_others_are_never_replaced(tmp_path, name):
     else:
         path.mkdir()
         (path / "000000.png").write_text("mine")
-    before, words = files(tmp_path), rf"{name} exists and is not part of an earlier result.*choose another folder"
+    before, words = contents(tmp_path), rf"{name} exists and is not part of an earlier result.*choose another folder"
     with pytest.raises(OutputError, match=words):
         make_room(1).save(tmp_path)
-    assert files(tmp_path) == before
+    assert contents(tmp_path) == before
     np.savez(tmp_path / "reconstruction.npz", points=np.zeros(3))
     with pytest.raises(OutputError, match=r"exists and is not part"):
         make_room(1).save(tmp_path)
@@ -36,7 +37,7 @@ def test_full_disk_leaves_the_earlier_result_untouched(tmp_path, monkeypatch, wr
     folder = tmp_path / "result"
     if earlier:
         make_room(2).save(folder)
-    before = files(tmp_path)
+    before = contents(tmp_path)
 
     def fail(*_, **__):
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -44,8 +45,8 @@ def test_full_disk_leaves_the_earlier_result_untouched(tmp_path, monkeypatch, wr
     monkeypatch.setattr(export, writer, fail)
     with pytest.raises(OutputError, match="No space left on device; choose a folder"):
         make_room(3).save(folder)
-    assert files(tmp_path) == before
-    assert {path.name for path in folder.iterdir()} == {name.split("/")[0] for name in files(folder)}
+    assert contents(tmp_path) == before
+    assert {path.name for path in folder.iterdir()} == {name.split("/")[0] for name in contents(folder)}
 
 
 def test_what_fails_leaves_nothing_behind(tmp_path):
@@ -68,7 +69,7 @@ def test_what_is_no_longer_written_goes_away_as_a_whole(tmp_path):
     make_room(2).save(tmp_path, format="vggt4d")
     make_room(3).save(tmp_path, only=("depth", "cameras"))
     numbers = (f"depth/{frame:06d}.{kind}" for frame in range(3) for kind in ("npy", "png"))
-    assert set(files(tmp_path)) == {
+    assert set(contents(tmp_path)) == {
         "notes.txt", "reconstruction.npz", "trajectory.txt", "intrinsics.txt", "depth/scale.txt", *numbers,
     }  # fmt: skip
     (tmp_path / "mask").mkdir()  # of this name, but not part of the result
@@ -81,7 +82,7 @@ def test_what_is_no_longer_written_goes_away_as_a_whole(tmp_path):
 def test_a_new_kind_of_file_is_not_lost(tmp_path):
     with pytest.raises(ValueError, match=r"\['notes.txt'\] would not be moved"), replacing(tmp_path, ()) as new:
         (new / "notes.txt").write_text("written by a new exporter")
-    assert not files(tmp_path)
+    assert not contents(tmp_path)
 
 
 def test_links_are_replaced_and_not_followed(tmp_path):
@@ -93,5 +94,5 @@ def test_links_are_replaced_and_not_followed(tmp_path):
     except OSError:
         pytest.skip("this system does not let us make links")
     make_room(2).save(tmp_path / "result")
-    assert set(files(elsewhere)) == {"000000.ply"}
-    assert set(files(tmp_path / "result")) == expected_files(2)
+    assert set(contents(elsewhere)) == {"000000.ply"}
+    assert set(contents(tmp_path / "result")) == expected_files(2)

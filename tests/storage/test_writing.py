@@ -64,12 +64,8 @@ def test_a_file_or_folder_appears_at_the_end(tmp_path):
         (temporary / "c").write_text("whole")
     with pytest.raises(TypeError), writing(tmp_path / "new" / "d") as temporary:
         temporary.write_text(3)  # pyright: ignore[reportArgumentType]: it makes the file, then fails
-    assert sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")) == [
-        "new",
-        "new/a.txt",
-        "new/b",
-        "new/b/c",
-    ]
+    there = [path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")]
+    assert sorted(there) == ["new", "new/a.txt", "new/b", "new/b/c"]
     with pytest.raises(OutputError, match=r"cannot write .*a\.txt/e"), writing(tmp_path / "new/a.txt/e"):
         pass
 
@@ -161,16 +157,10 @@ def test_an_error_names_what_is_in_the_way(tmp_path):
     (tmp_path / "link").symlink_to("nowhere")
     (tmp_path / "there").symlink_to("file")
     os.mkfifo(tmp_path / "pipe")
-    for name, kind in (
-        ("file", "a file"),
-        ("there", "a file"),
-        ("link", "a link to nowhere, which does not exist"),
-        ("pipe", "not a folder"),
-    ):
-        with (
-            pytest.raises(OutputError, match=f"{name}/new: .*/{name} is {kind}; choose"),
-            staging(tmp_path / name / "new"),
-        ):
+    there = {"file": "a file", "there": "a file", "link": "a link to nowhere, which does not", "pipe": "not a folder"}
+    for name, kind in there.items():
+        refused = pytest.raises(OutputError, match=f"{name}/new: .*/{name} is {kind}")
+        with refused, staging(tmp_path / name / "new"):
             pass
     for error in (OSError(errno.ENOSPC, "No space left"), OSError("No space left")):  # with and without a number
         with pytest.raises(OutputError, match=f"cannot write {tmp_path}: No space left; "), write_errors(tmp_path):

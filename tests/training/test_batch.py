@@ -59,9 +59,8 @@ def test_regions_are_compact_and_move():
     assert 0.05 < shares.mean() < 0.35
     assert shares.max() < 2 * 0.7**2
     assert np.mean(np.any(regions[:, 0] != regions[:, -1], axis=(1, 2))) > 0.95
-    alone = [
-        clip for clip in regions if clip.any((1, 2)).all() and not (clip[:, [0, -1]].any() | clip[..., [0, -1]].any())
-    ]
+    rims = regions[:, :, [0, -1]].any((1, 2, 3)) | regions[..., [0, -1]].any((1, 2, 3))
+    alone = regions[regions.any((2, 3)).all(axis=1) & ~rims]
     centres = np.array([[ndimage.center_of_mass(frame) for frame in clip] for clip in alone])
     assert len(alone) > 2
     assert np.abs(np.diff(centres, 2, axis=1)).max() < 1.5
@@ -91,9 +90,8 @@ def test_the_objective_suppresses_keys_as_a_second_pass_does(batch, trained, sup
         patches = encode(model, clips.images, CONFIG)
         grid = patch_grid(clips.images, CONFIG)
         suppression = Suppression(tokens, suppress, pairs)
-        camera, _, _ = aggregate(
-            model, patches, CONFIG, grid, captures=[identity] * len(CONFIG.taps), suppression=suppression
-        )
+        captures = [identity] * len(CONFIG.taps)
+        camera, _, _ = aggregate(model, patches, CONFIG, grid, captures=captures, suppression=suppression)
         error = jnp.abs(predict_pose(model, camera, CONFIG) - targets(clips).pose_encoding)
         return error[..., :3].sum(axis=-1).mean()
 

@@ -98,11 +98,9 @@ def test_damaged_checkpoints(tmp_path, saved, shapes):
             os.mkfifo(folder / "3" / name)
         else:
             (folder / "3" / name).write_bytes(content)
-        with pytest.raises(
-            CheckpointError, match=r"cannot be read as a checkpoint|is a checkpoint of|holds the state|is a pipe"
-        ) as error:
+        says = "is a pipe" if content is None else "cannot be read as a checkpoint|is a checkpoint of|holds the state"
+        with pytest.raises(CheckpointError, match=says):
             restore(folder, shapes, SHORT)
-        assert ("is a pipe" in str(error.value)) == (content is None)
 
 
 def test_where_a_read_fails_the_others_end_before_orbax_closes_their_loop(tmp_path):

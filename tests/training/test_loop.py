@@ -5,13 +5,12 @@ import os
 import shutil
 import signal
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.shared.training_runs import PROBES, SHORT, TASK, measured
-from vggtjax.errors import InputError, OutputError, VggtjaxError
+from tests.shared.training_runs import PROBES, SHORT, TASK, measured, same
+from vggtjax.errors import OutputError, VggtjaxError
 from vggtjax.network.checkpoint import read_model
 from vggtjax.network.model import init_params
 from vggtjax.training.checkpoints import latest
@@ -23,10 +22,6 @@ from vggtjax.training.run import MOST_SKIPPED
 from vggtjax.training.state import exported
 
 NOW = 1e-9  # seconds: a run that ends after one step
-
-
-def same(a, b) -> bool:
-    return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
 
 
 @pytest.fixture(scope="module")
@@ -130,11 +125,3 @@ def test_frames_and_sizes_depend_on_seed_and_step_alone():
     assert {tuple(size) for _, *size in shapes} == {(28, 28), (14, 28), (28, 42)}
     alone = drawn(dataclasses.replace(phase, sizes=()), 0)  # further sizes leave the numbers of frames as they were
     assert [frames for frames, *_ in alone] == [frames for frames, *_ in shapes]
-
-
-def test_bad_arguments(tmp_path):
-    with pytest.raises(InputError, match="dtype is 'float16'"):
-        RunOptions(dtype="float16")  # type: ignore[arg-type]
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="cannot write"):
-        train(SHORT, tmp_path / "file", task=TASK)

@@ -17,14 +17,9 @@ make_optimiser: Any = make_typed_optimiser  # optax's types know no dictionaries
 
 
 def recipe_with(**optimiser: Any) -> Recipe:
-    values: dict[str, Any] = {
-        "learning_rate": 0.1,
-        "warmup_steps": 0,
-        "decay_steps": 0,
-        "weight_decay": 0,
-        "clip_norm": 1e9,
-    }
-    return dataclasses.replace(RECIPE, optimiser=OptimiserConfig(**{**values, **optimiser}))
+    plain: dict[str, Any] = {"learning_rate": 0.1, "clip_norm": 1e9}
+    plain |= dict.fromkeys(("warmup_steps", "decay_steps", "weight_decay"), 0)
+    return dataclasses.replace(RECIPE, optimiser=OptimiserConfig(**(plain | optimiser)))
 
 
 def rates(config: OptimiserConfig, total_steps: int, updates: Iterable[int]) -> np.ndarray:
@@ -35,9 +30,7 @@ def rates(config: OptimiserConfig, total_steps: int, updates: Iterable[int]) -> 
 def first_updates(recipe: Recipe, gradient: Any, params: Any) -> Any:
     """Return the updates of the first step."""
     optimiser = make_optimiser(recipe)
-    return jax.jit(lambda gradient, params: optimiser.update(gradient, optimiser.init(params), params)[0])(
-        gradient, params
-    )
+    return jax.jit(lambda g, p: optimiser.update(g, optimiser.init(p), p)[0])(gradient, params)
 
 
 def tree() -> Any:

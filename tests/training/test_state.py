@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.shared.training_runs import RECIPE, SHORT, TASK, init_probes, make_batch, objective, train_step
+from tests.shared.training_runs import RECIPE, SHORT, TASK, init_probes, make_batch, objective, same, train_step
 from vggtjax.errors import CheckpointError
 from vggtjax.network.checkpoint import read_model, save_model
 from vggtjax.network.model import init_params
@@ -26,10 +26,6 @@ def start():
 @pytest.fixture(scope="module")
 def batch():
     return make_batch(jax.random.key(0), TASK.textures, SHORT.stages[0], 2)
-
-
-def same(a, b) -> bool:
-    return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
 
 
 def test_a_step_moves_heads_and_probes_alone(start, batch):
@@ -88,9 +84,8 @@ def test_fine_tuning_on_generated_clips(tmp_path):
     path = save_model(tmp_path / "model.safetensors", params, recipe.model)
     state = initial_state(recipe, scenes_probes(0, recipe.model), read_model(path).params)
     assert same(state.trained["model"], params)
-    batch = jax.jit(scenes_batch, static_argnums=(2, 3))(
-        jax.random.key(1), load_textures("training"), recipe.stages[0], 3
-    )
+    draw = jax.jit(scenes_batch, static_argnums=(2, 3))
+    batch = draw(jax.random.key(1), load_textures("training"), recipe.stages[0], 3)
     losses = []
     for _ in range(5):
         state, metrics = train_step(state, batch, recipe, scenes_objective)

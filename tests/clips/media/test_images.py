@@ -1,12 +1,10 @@
 """Image files of every kind as RGB, and files that cannot be read."""
 
-import struct
-import zlib
-
 import numpy as np
 import pytest
 from PIL import Image
 
+from tests.shared.dataset_files import png, write
 from vggtjax.clips.media.images import read_image
 from vggtjax.errors import ClipError
 
@@ -32,14 +30,7 @@ def test_sixteen_bit_grey_is_scaled_not_clipped(tmp_path, name):
 
 
 def test_sixteen_bit_colour_is_scaled_not_clipped(tmp_path):
-    def chunk(kind, data):
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-    colours = np.array([[[0, 32896, 65535], [65535, 0, 257]]], ">u2")
-    header = struct.pack(">IIBBBBB", 2, 1, 16, 2, 0, 0, 0)
-    data = zlib.compress(b"\0" + colours.tobytes())
-    path = tmp_path / "colour.png"
-    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b""))
+    path = write(tmp_path / "colour.png", png(np.array([[[0, 32896, 65535], [65535, 0, 257]]], np.uint16)))
     np.testing.assert_array_equal(pixels(path), [[[0, 128, 255], [255, 0, 1]]])
 
 

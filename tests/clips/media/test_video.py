@@ -129,13 +129,11 @@ def test_files_that_are_no_video(tmp_path, even):
 
 
 def test_a_playlist_is_not_followed(tmp_path, even):
-    path = tmp_path / "list.mp4"
-    path.write_text(f"ffconcat version 1.0\nfile {even}\n")
-    with pytest.raises(ClipError, match="cannot read video"):
-        read(path)
-    path.write_text(f"#EXTM3U\n#EXT-X-TARGETDURATION:2\n#EXTINF:2,\n{even}\n#EXT-X-ENDLIST\n")
-    with pytest.raises(ClipError, match="cannot read video"):
-        read(path)
+    path, entry = tmp_path / "list.mp4", f"#EXTINF:2,\n{even}\n#EXT-X-ENDLIST\n"
+    for text in (f"ffconcat version 1.0\nfile {even}\n", f"#EXTM3U\n#EXT-X-TARGETDURATION:2\n{entry}"):
+        path.write_text(text)
+        with pytest.raises(ClipError, match="cannot read video"):
+            read(path)
 
 
 def test_sound_and_a_cover_are_no_video(tmp_path):

@@ -22,9 +22,7 @@ vggtjax.interface.commands.main.main = work
 sys.exit(run())
 """
 _WORKS = 'print("working", flush=True); '
-_COMPILED = (
-    _WORKS + 'hashlib.pbkdf2_hmac("sha256", b"", b"", 10**9)'
-)  # for minutes, as XLA does; no signal is heard in it
+_COMPILED = _WORKS + 'hashlib.pbkdf2_hmac("sha256", b"", b"", 10**9)'  # for minutes, as XLA; no signal is heard in it
 _PYTHON = _WORKS + "time.sleep(600)"
 _SERVER = """
         try:

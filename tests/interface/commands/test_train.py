@@ -66,6 +66,7 @@ def test_bad_input(recipe, tmp_path, monkeypatch):
     for values, says in (
         ({"seconds": 0.0}, "seconds is 0.0"),
         ({"log_every": 0}, "log_every is 0"),
+        ({"dtype": "float16"}, "dtype is 'float16'"),
     ):
         with pytest.raises(InputError, match=says):
             RunOptions(**values)  # type: ignore[arg-type]

@@ -7,7 +7,6 @@ import pytest
 from PIL import Image
 
 from tests.shared.room import make_room
-from vggtjax.clips.captures.depth_files import read_npy, read_npz
 from vggtjax.errors import InputError
 from vggtjax.pipeline.known.apply import apply_known, scaled
 from vggtjax.pipeline.known.depth_maps import read_depth_maps
@@ -55,9 +54,8 @@ def test_layouts_of_public_models_at_their_own_size(tmp_path, writer, larger, pe
     depths = TRUE.depth.repeat(larger, axis=1).repeat(larger, axis=2)
     depths[0, :5] = 0  # unknown
     folder = write(tmp_path / "maps", writer, depths)
-    np.testing.assert_allclose(
-        read_depth_maps(tmp_path / "maps", TRUE, per_metre)[1:], TRUE.depth[1:], atol=1 / 256 if per_metre else 1e-6
-    )
+    maps = read_depth_maps(tmp_path / "maps", TRUE, per_metre)
+    np.testing.assert_allclose(maps[1:], TRUE.depth[1:], atol=1 / 256 if per_metre else 1e-6)
     known = KnownGeometry(known_depths=folder, depths_per_metre=per_metre)
     check_readable(known)
     found, unit = apply_known(SMALL, read_known(known, SMALL))
@@ -121,11 +119,7 @@ def test_disparities_are_warned_of(tmp_path, caplog):
 @pytest.mark.parametrize(
     ("writer", "depth", "words"),
     [
-        (
-            unidepth,
-            np.ones((84, 56)),
-            "a0.npy has 56 x 84 pixels and its picture 168 x 112; expected the same shape.*EXIF",
-        ),
+        (unidepth, np.ones((84, 56)), "has 56 x 84 pixels and its picture 168 x 112; expected the same shape.*EXIF"),
         (unidepth, np.ones((56, 56)), "expected the same shape$"),
         (unidepth, np.full((56, 84), np.nan), "has maps without a known depth"),
         (lambda path, depth: np.savez(path, a=depth, b=depth), np.ones((56, 84)), "has the arrays a, b; expected one"),
@@ -136,26 +130,15 @@ def test_disparities_are_warned_of(tmp_path, caplog):
 )
 def test_maps_that_do_not_fit_are_refused_in_a_sentence(tmp_path, writer, depth, words):
     folder = write(tmp_path / "maps", writer, [depth] * 4)
-    with pytest.raises(InputError, match=words) as problem:
+    with pytest.raises(InputError, match=words):
         read_known(KnownGeometry(known_depths=folder), TRUE)
-    assert "\n" not in str(problem.value)
 
 
 def test_options_without_depths_are_refused():
-    wrong: list[dict[str, Any]] = [
-        {"robust": True},
-        {"depths_per_metre": 256.0},
-        {"known_depths": "source", "depths_per_metre": 5.0},
-    ]
+    per_metre: dict[str, Any] = {"depths_per_metre": 256.0}
+    wrong = [{"robust": True}, per_metre, per_metre | {"known_depths": "source"}]
     for options in wrong:
         with pytest.raises(InputError, match="with --known-depths"):
             KnownGeometry(**options)
     with pytest.raises(InputError, match=r"depths_per_metre is 0\.0; expected a number above 0"):
         KnownGeometry(known_depths="maps", depths_per_metre=0)
-
-
-def test_axes_of_length_one_are_left_out(tmp_path):
-    np.save(tmp_path / "a.npy", np.ones((1, 4, 1, 6), np.uint16))
-    np.testing.assert_array_equal(read_npy(tmp_path / "a.npy", 1000), np.full((4, 6), 0.001, np.float32))
-    np.savez(tmp_path / "a.npz", only=np.ones((4, 6)))
-    assert read_npz(tmp_path / "a.npz").shape == (4, 6)

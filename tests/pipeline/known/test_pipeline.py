@@ -5,20 +5,9 @@ import pytest
 from PIL import Image
 
 from tests.shared.moving_ball import moving_ball
-from tests.shared.tiny import tiny_model
-from vggtjax import Reconstruction, load_clip, reconstruct, reconstruct_many
+from vggtjax import Reconstruction, reconstruct, reconstruct_many
 from vggtjax.errors import InputError
 from vggtjax.pipeline.known.options import KnownGeometry
-
-
-@pytest.fixture(scope="module")
-def model():
-    return tiny_model()
-
-
-@pytest.fixture(scope="module")
-def clip():
-    return load_clip((255 * np.asarray(moving_ball(3))).astype(np.uint8), size=56)
 
 
 @pytest.mark.filterwarnings("ignore:the field of view")
@@ -29,12 +18,8 @@ def test_masks_intrinsics_and_scale_reach_the_result(model, clip, tmp_path):
     for name in clip.frame_names:
         Image.fromarray(sky).save(tmp_path / f"{name}.png")
     (tmp_path / "depths.csv").write_text(f"frame,x,y,depth\n1,{width / 2},{height - 1},3\n")
-    focal = 1.2 * width
-    known = KnownGeometry(
-        intrinsics=f"{focal},{focal},{width / 2},{height / 2}",
-        known_depths=str(tmp_path / "depths.csv"),
-        leave_out=tmp_path,
-    )
+    K, depths = f"{1.2 * width},{1.2 * width},{width / 2},{height / 2}", str(tmp_path / "depths.csv")
+    known = KnownGeometry(intrinsics=K, known_depths=depths, leave_out=tmp_path)
     plain = reconstruct(model, clip, method="vggt")
     made = reconstruct(model, clip, method="vggt", known=known)
     kept = made.depth[:, 28:]
@@ -42,7 +27,7 @@ def test_masks_intrinsics_and_scale_reach_the_result(model, clip, tmp_path):
     np.testing.assert_allclose(kept / plain.depth[:, 28:], made.depth[1, 55, 28] / plain.depth[1, 55, 28], rtol=1e-5)
     assert made.depth[1, 55, 28] == pytest.approx(3)
     np.testing.assert_allclose(made.intrinsics[:, [0, 1], [0, 1]], 1.2 * 56, rtol=1e-6)
-    assert made.settings["known"]["known_depths"] == str(tmp_path / "depths.csv")
+    assert made.settings["known"]["known_depths"] == depths
     assert set(made.known_facts) == {"left out", "intrinsics", "scale"}
 
 

@@ -3,7 +3,7 @@
 from itertools import pairwise
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from vggtjax.pipeline.windows.plan import Windows, blend_weights, plan_windows, shared_frames
@@ -17,7 +17,6 @@ def test_a_plan_by_hand():
     assert (windows.shared, windows.cuts(16), windows.cuts(17)) == (4, False, True)
 
 
-@settings(deadline=None)  # a busy machine is slow
 @given(window=st.integers(4, 40), data=st.data())
 def test_every_plan_covers_the_clip_with_equal_windows_and_as_few_as_can_be(window, data):
     overlap = data.draw(st.integers(2, window // 2))
@@ -30,7 +29,6 @@ def test_every_plan_covers_the_clip_with_equal_windows_and_as_few_as_can_be(wind
     assert frames > (len(windows) - 1) * (window - overlap) + overlap  # one window fewer does not reach the end
 
 
-@settings(deadline=None)  # a busy machine is slow
 @given(window=st.integers(4, 30), frames=st.integers(31, 120))
 def test_weights_of_a_frame_sum_to_one_and_fall_towards_the_end_of_a_window(window, frames):
     windows = plan_windows(frames, window, max(2, window // 4))

@@ -14,7 +14,7 @@ from vggtjax.errors import InputError
 from vggtjax.interface.commands.calibrate_cues import calibrate_cues, generated_clips
 from vggtjax.method.soft_mask import soft_masking
 from vggtjax.network.checkpoint import Model, save_model
-from vggtjax.options import METHODS, Options, pairs_to_try
+from vggtjax.options import METHODS, pairs_to_try
 from vggtjax.research.calibration.choice import Choice, Rating
 from vggtjax.research.calibration.export import calibrated
 from vggtjax.research.calibration.second_pass import CameraErrors, SecondPassChoice, Setting, choose_second_pass
@@ -88,8 +88,6 @@ def test_a_model_recommends_its_threshold_and_number(model, tmp_path):
     assert not np.array_equal(made.dynamic_mask, plain.dynamic_mask)
     settings = ModelSource(loaded, ["4dvggt-d"]).settings
     assert (settings["threshold"], settings["mask_pairs"]) == ("multi-otsu", 1)
-    settings = ModelSource(loaded, ["4dvggt-d"], Options(threshold="otsu", mask_pairs=3)).settings
-    assert (settings["threshold"], settings["mask_pairs"]) == ("otsu", 3)
     assert "threshold" not in ModelSource(model, ["4dvggt-d"]).settings
     assert soft_masking(config).strength.sum() == 1
     assert soft_masking(model.config).strength.sum() == 4

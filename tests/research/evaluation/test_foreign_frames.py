@@ -5,9 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from tests.results.foreign_writers import ROOM, WRITERS
 from tests.shared.room import make_room
-from vggtjax import Reconstruction, load_clip
+from vggtjax import load_clip
 from vggtjax.errors import InputError
 from vggtjax.research.evaluation.foreign_frames import placed
 
@@ -104,21 +103,6 @@ def test_frames_of_others_are_the_sequences_by_number_or_time_or_not_at_all():
     assert found(keyframes, letters[:4], times) == {"b": 0, "d": 1}
     named = [f"17000000{second:02d}.000000" for second in range(4)]
     assert found(numbered(0, 1, times=np.array([1700000001.0, 1700000003.0])), named) == {named[1]: 0, named[3]: 1}
-
-
-@pytest.mark.parametrize("lost", [0, 2])
-def test_a_folder_with_a_lost_frame_is_placed_as_it_was_written(tmp_path, lost):
-    tmp_path = tmp_path / "result"
-    WRITERS["monst3r"](tmp_path)
-    lines = (tmp_path / "pred_traj.txt").read_text().splitlines()
-    lines[lost] = f"{lost} " + "nan " * 7
-    (tmp_path / "pred_traj.txt").write_text("\n".join(lines))
-    result = Reconstruction.load(tmp_path, format="monst3r", quaternion="wxyz")
-    names = ["frame_0001", "frame_0002", "frame_0003"]
-    made = placed(result, "monst3r", [(42, 28)] * 3, names)
-    left = [frame for frame in range(3) if frame != lost]
-    assert made.frame_names == tuple(names[frame] for frame in left)
-    np.testing.assert_array_equal(made.depth, ROOM.depth[left])
 
 
 @pytest.mark.parametrize("lost", [0, 2, 4])

@@ -23,9 +23,8 @@ def model():
 
 
 def retrained(model):
-    return dataclasses.replace(
-        model, params=jax.tree.map(lambda leaf: np.asarray(leaf) * np.float32(1.001), model.params)
-    )
+    params = jax.tree.map(lambda leaf: np.asarray(leaf) * np.float32(1.001), model.params)
+    return dataclasses.replace(model, params=params)
 
 
 def test_retrained_weights_are_another_model(tmp_path, model):

@@ -15,11 +15,8 @@ from vggtjax.method.fusion.family import Observations, fuse, log_precisions, pap
 from vggtjax.research.learning.fit import FitClips, FitConfig, fit_fusion
 from vggtjax.research.learning.objectives import joint_negative_log_likelihood, unit_factor
 
-TRUE = paper_rule() | {
-    "scale": jnp.asarray([2.5, 1.5]),
-    "power": jnp.asarray([0.6, 1.3]),
-    "correlation": jnp.asarray(0.5),
-}
+_TRUE = {"scale": [2.5, 1.5], "power": [0.6, 1.3], "correlation": 0.5}
+TRUE = paper_rule() | {name: jnp.asarray(value) for name, value in _TRUE.items()}
 FAMILY = ("scale", "power", "correlation")
 STANDARD_ERRORS = {"scale": [0.0134, 0.0120], "power": [0.0082, 0.0082], "correlation": 0.0048}
 

@@ -90,6 +90,7 @@ def _in_float64(tree):
     return jax.device_put(jax.tree.map(lambda x: np.asarray(x, np.float64), tree))
 
 
+@pytest.mark.proof
 def test_every_gradient_by_finite_differences():
     """Of depth, precision, points and cameras along a random direction of each knob: masks, fusion and a weight."""
     weights32, pictures32 = params(), images(1)

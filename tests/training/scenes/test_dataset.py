@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.shared.contents import contents
 from tests.shared.generated import QUICK, textures
 from vggtjax.errors import InputError, OutputError
 from vggtjax.interface.commands.scenes import Images, scenes
@@ -51,10 +52,6 @@ def test_an_evaluation_reads_the_set(written):
     assert sequence.mask(1).shape == (H, W)
     assert np.allclose(sequence.intrinsics[:, [0, 1], 2], [W / 2, H / 2])
     assert np.abs(np.diff(sequence.world_from_camera[:, :3, 3], axis=0)).max() > 0
-
-
-def files(folder):
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def arrays(scene, name, ending="png"):
@@ -112,16 +109,16 @@ def test_a_set_goes_on_where_it_stopped(written, tmp_path, monkeypatch):
     assert progress == [(1, 2), (2, 2)]
     assert folders == [out / "scene_0000", out / "scene_0001"]
     assert (out / "scene_0000").stat().st_mtime_ns == kept.st_mtime_ns
-    assert files(out) == files(written)  # as if it had never stopped
+    assert contents(out) == contents(written)  # as if it had never stopped
 
 
 def test_sets_of_other_settings_are_not_mixed(written):
-    before = files(written)
+    before = contents(written)
     with pytest.raises(InputError, match="holds scenes with seed 3 instead of 4; choose another folder"):
         write_scenes(written, CONFIG, count=3, seed=4)
     with pytest.raises(InputError, match=r"with roll of config 0.0 instead of 9.0; choose"):
         write_scenes(written, dataclasses.replace(CONFIG, roll=9), count=3, seed=3)
-    assert files(written) == before
+    assert contents(written) == before
 
 
 @pytest.mark.parametrize(

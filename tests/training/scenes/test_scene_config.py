@@ -20,11 +20,6 @@ def test_bad_values_are_one_sentence():
             SceneConfig(**changes)
 
 
-def test_lists_become_tuples_so_that_a_config_is_static_under_jit():
-    config = SceneConfig(motion=[0.1, 0.2], field_of_view=[50, 60])  # type: ignore[arg-type]
-    assert hash(config) == hash(SceneConfig(motion=(0.1, 0.2), field_of_view=(50, 60)))
-
-
 def test_parts_of_the_figure_come_first_in_each_kind():
     config = SceneConfig(boxes=2, ellipsoids=1, cylinders=1)
     assert config.kinds == ("box",) * 3 + ("ellipsoid",) * 2 + ("cylinder",) * 5

@@ -9,19 +9,8 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from tests.shared.dataset_files import (
-    cam,
-    camera_json,
-    cameras_bin,
-    depth_png,
-    dpt,
-    images_bin,
-    npy,
-    opened,
-    picture,
-    png,
-    write,
-)
+from tests.shared import dataset_files as made
+from tests.shared.dataset_files import opened, write
 from tests.shared.documented import DOCS
 from vggtjax.research.evaluation.datasets import DATASETS
 
@@ -47,12 +36,12 @@ def _lines(says: str) -> str:
 
 # What is in the files: the first pattern that the end of a path fits.
 CONTENTS = {
-    r"(Annotations|mask)/.*\.png": png(np.full((3, 4), 255, np.uint8)),
-    r"(rgb|images|final|image_02/data|image_gathered|480p)/.*|color\.png": picture(),
-    r"depth.*\.png": depth_png([[1000] * 4] * 3),
-    r"\.npy": npy(np.ones((3, 4), np.float32)),
-    r"\.dpt": dpt(np.ones((3, 4))),
-    r"\.cam": cam(K, np.eye(3, 4)),
+    r"(Annotations|mask)/.*\.png": made.png(np.full((3, 4), 255, np.uint8)),
+    r"(rgb|images|final|image_02/data|image_gathered|480p)/.*|color\.png": made.picture(),
+    r"depth.*\.png": made.depth_png([[1000] * 4] * 3),
+    r"\.npy": made.npy(np.ones((3, 4), np.float32)),
+    r"\.dpt": made.dpt(np.ones((3, 4))),
+    r"\.cam": made.cam(K, np.eye(3, 4)),
     r"K\.txt": "4 0 2\n0 4 1.5\n0 0 1\n",
     r"world_from_camera\.txt": f"{ROW}\n",
     r"transforms\.json": json.dumps(TRANSFORMS),
@@ -61,9 +50,9 @@ CONTENTS = {
     r"groundtruth\.txt": _lines("0 0 0 0 0 0 1"),
     r"calibration\.txt": "4 4 2 1.5\n",
     r"train\.json": json.dumps({"frame_names": ["0_00000"]}),
-    r"camera/0_00000\.json": camera_json(),
-    r"cameras\.bin": cameras_bin([(1, 1, 4, 3, [4.0, 4.0, 2.0, 1.5])]),
-    r"images\.bin": images_bin([(1, (1, 0, 0, 0), (0, 0, 0), 1, "0_00000.png")]),
+    r"camera/0_00000\.json": made.camera_json(),
+    r"cameras\.bin": made.cameras_bin([(1, 1, 4, 3, [4.0, 4.0, 2.0, 1.5])]),
+    r"images\.bin": made.images_bin([(1, (1, 0, 0, 0), (0, 0, 0), 1, "0_00000.png")]),
     r"calib_cam_to_cam\.txt": "P_rect_02: 4 0 2 0 0 4 1 0 0 0 1 0\n",
     r"pose\.txt": "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n",
 }

@@ -50,9 +50,8 @@ def slow_boundary_f(predicted, truth) -> float:
         return 1.0
     if not found.any() or not sought.any():
         return 0.0
-    precision, recall = (
-        (np.asarray(distance_transform_edt(~b))[a] <= radius).mean() for a, b in ((found, sought), (sought, found))
-    )
+    ways = ((found, sought), (sought, found))
+    precision, recall = ((np.asarray(distance_transform_edt(~b))[a] <= radius).mean() for a, b in ways)
     return 2 * precision * recall / (precision + recall) if precision + recall else 0.0
 
 
