@@ -31,13 +31,6 @@ def folder(place, *names):
     return place
 
 
-def marked():
-    """A picture whose upper left quarter is red."""
-    image = Image.new("RGB", SIZE, BLUE)
-    image.paste(RED, (0, 0, SIZE[0] // 2, SIZE[1] // 2))
-    return image
-
-
 def saved(path, image, *others, **options):
     """Write HEIF without the library's plugin for Pillow, which would also read it."""
     if path.suffix.lower() not in (".heic", ".heif", ".hif"):
@@ -55,14 +48,16 @@ def exif(orientation):
     return tags.tobytes()
 
 
-# Where the red quarter is shown, by EXIF's orientation.
+# Where the quarter that is red in the upper left is shown, by EXIF's orientation.
 CORNERS = {1: (0, 0), 3: (1, 1), 6: (1, 0), 8: (0, 1)}
 
 
 @pytest.mark.parametrize("orientation", CORNERS)
 @pytest.mark.parametrize("ending", ["heic", "HIF", "avif", "jpg"])
 def test_photos_are_upright(tmp_path, ending, orientation):
-    saved(tmp_path / f"a.{ending}", marked(), exif=exif(orientation), quality=95)
+    image = Image.new("RGB", SIZE, BLUE)
+    image.paste(RED, (0, 0, SIZE[0] // 2, SIZE[1] // 2))
+    saved(tmp_path / f"a.{ending}", image, exif=exif(orientation), quality=95)
     (frame,) = open_source(tmp_path / f"a.{ending}").frames(Sampling())
     width, height = frame.image.size
     assert (width, height) == (SIZE if orientation in (1, 3) else SIZE[::-1])

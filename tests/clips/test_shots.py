@@ -24,13 +24,8 @@ def place(seed, frames, step=3):
     coarse = Image.fromarray(rng.integers(0, 255, (24, 24, 3), np.uint8))
     tint = rng.uniform(0.3, 1, 3)
     wall = np.asarray(coarse.resize((400, 400), Image.Resampling.BICUBIC)) * tint
-    return [
-        wall[step * i : step * i + SIDE, 2 * step * i : 2 * step * i + SIDE].astype(np.uint8) for i in range(frames)
-    ]
-
-
-def shown(pictures):
-    return [look_at(Image.fromarray(picture)) for picture in pictures]
+    starts = range(0, step * frames, step)
+    return [wall[at : at + SIDE, 2 * at : 2 * at + SIDE].astype(np.uint8) for at in starts]
 
 
 BLACK, GREY = np.zeros((SIDE, SIDE, 3), np.uint8), np.full((SIDE, SIDE, 3), 120, np.uint8)
@@ -78,7 +73,7 @@ LONG = place(1, 9)
     ],
 )
 def test_frames_that_are_no_part_of_the_scene(pictures, blank, flashes, shots):
-    found = find_shots(shown(pictures))
+    found = find_shots([look_at(Image.fromarray(picture)) for picture in pictures])
     assert found.blank == blank
     assert found.flashes == flashes
     assert [(shot.start, shot.stop) for shot in found.shots] == shots

@@ -12,10 +12,12 @@ from pathlib import Path
 import pytest
 
 from tests.fuzz.cases import Reader, Sample, read, scratch_folder
-from tests.fuzz.readers import READERS
+from tests.fuzz.rows import foreign, own_files, weights
 from tests.shared.dataset_files import write
 from vggtjax.errors import ClipError, InputError, VggtjaxError
 
+# Every place where a file or a folder of a stranger enters the library, used as the commands use it.
+READERS = (*weights.ROWS, *own_files.ROWS, *foreign.ROWS)
 CASES, MANY = 4, 2000
 PATIENCE = 60.0  # seconds of a case; a busy machine is no fault of the reader
 CORPUS = Path(__file__).parent / "corpus"

@@ -43,11 +43,6 @@ def test_so_are_those_of_a_gpu(frames, counted):
     assert predicted < memory.pass_bytes(vggt_1b(), frames, 392, 518, accelerator=False)
 
 
-@pytest.fixture
-def two_cores(monkeypatch):
-    monkeypatch.setattr("vggtjax.network.kernels.cpu_attention.times_for_cores", lambda: 1)
-
-
 def test_the_logits_that_more_cores_hold_at_once_are_counted(monkeypatch):
     queries, keys = 4 * (5 + 21 * 37), 32 * (5 + 21 * 37)  # of one of eight devices
     needs, rows = [], []
@@ -77,9 +72,10 @@ def test_the_logits_that_more_cores_hold_at_once_are_counted(monkeypatch):
     ],
 )
 def test_the_peaks_of_processes_are_predicted_within_the_error_that_is_promised(
-    monkeypatch, two_cores, frames, height, width, method, devices, measured
+    monkeypatch, frames, height, width, method, devices, measured
 ):
     monkeypatch.setattr("jax.local_device_count", lambda: devices)
+    monkeypatch.setattr("vggtjax.network.kernels.cpu_attention.times_for_cores", lambda: 1)
     predicted = memory.predicted_bytes(demo_model(), frames, height, width, method=method, devices=devices)
     assert predicted == pytest.approx(1e6 * measured, rel=memory.ERROR)
 

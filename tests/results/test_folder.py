@@ -1,5 +1,3 @@
-"""Results that replace earlier ones, in processes that are killed at any moment."""
-
 import errno
 import shutil
 from contextlib import contextmanager

@@ -1,6 +1,5 @@
-"""Results saved over earlier files: replaced as a whole, or left untouched."""
-
 import errno
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,8 +8,10 @@ from tests.results.test_export import expected_files
 from tests.shared.contents import contents
 from tests.shared.room import make_room
 from vggtjax.errors import InputError, OutputError
-from vggtjax.results import export
+from vggtjax.results import disk, export
+from vggtjax.results.disk import forecast_bytes
 from vggtjax.results.folder import replacing
+from vggtjax.results.saving import Saving
 
 pytestmark = pytest.mark.usefixtures("empty_reports")
 
@@ -69,9 +70,8 @@ def test_what_is_no_longer_written_goes_away_as_a_whole(tmp_path):
     make_room(2).save(tmp_path, format="vggt4d")
     make_room(3).save(tmp_path, only=("depth", "cameras"))
     numbers = (f"depth/{frame:06d}.{kind}" for frame in range(3) for kind in ("npy", "png"))
-    assert set(contents(tmp_path)) == {
-        "notes.txt", "reconstruction.npz", "trajectory.txt", "intrinsics.txt", "depth/scale.txt", *numbers,
-    }  # fmt: skip
+    single = ("notes.txt", "reconstruction.npz", "trajectory.txt", "intrinsics.txt", "depth/scale.txt")
+    assert set(contents(tmp_path)) == {*single, *numbers}
     (tmp_path / "mask").mkdir()  # of this name, but not part of the result
     make_room(2).save(tmp_path, only=("previews",))
     with pytest.raises(OutputError, match="mask exists and is not part of an earlier result"):
@@ -96,3 +96,25 @@ def test_links_are_replaced_and_not_followed(tmp_path):
     make_room(2).save(tmp_path / "result")
     assert set(contents(elsewhere)) == {"000000.ply"}
     assert set(contents(tmp_path / "result")) == expected_files(2)
+
+
+SAVINGS = [Saving(resolution="original", format="vggt4d"), Saving(only=("clouds",))]
+
+
+@pytest.mark.parametrize("saving", SAVINGS)
+def test_the_forecast_is_right_within_a_factor_of_two(tmp_path, saving):
+    random = np.random.default_rng(0)
+    noise = random.integers(0, 60, (2, 112, 154, 3))
+    plain = make_room(2, 112, 154)
+    room = make_room(2, 112, 154, images=(plain.images // 2 + noise).astype(np.uint8))
+    room.save(tmp_path, saving=saving)
+    written = sum(path.stat().st_size for path in tmp_path.rglob("*") if path.is_file())
+    assert 0.5 < forecast_bytes(room.depth.shape, room.source_size, saving) / written < 2
+
+
+def test_too_little_space_is_said_before_anything_is_written(tmp_path, monkeypatch):
+    monkeypatch.setattr(disk.shutil, "disk_usage", lambda _: SimpleNamespace(free=1000))
+    words = r"takes about [0-9.]+ kB and the disk of .* has 1.0 kB left; free some, .*--only"
+    with pytest.raises(OutputError, match=words):
+        make_room(1).save(tmp_path / "new")
+    assert not (tmp_path / "new").exists()

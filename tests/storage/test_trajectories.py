@@ -1,5 +1,3 @@
-"""Trajectories as text, written and read."""
-
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings

@@ -1,5 +1,3 @@
-"""Writers: whole files or none, no leftovers of killed writers, one writer for a locked folder."""
-
 import errno
 import os
 import signal

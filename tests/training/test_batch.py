@@ -1,4 +1,4 @@
-"""Batches: regions of suppressed keys, their share of the clips and effect on the network."""
+"""Batches and what is minimised: regions of suppressed keys and their effect; terms that can be computed by hand."""
 
 import dataclasses
 from functools import partial
@@ -18,7 +18,7 @@ from vggtjax.network.heads.camera_head import predict_pose
 from vggtjax.network.model import init_params
 from vggtjax.network.suppression import Suppression
 from vggtjax.training.data import make_batch
-from vggtjax.training.objective import LossWeights, init_probes, objective
+from vggtjax.training.objective import LossWeights, _flow_moments, init_probes, objective
 from vggtjax.training.recipe import Phase
 from vggtjax.training.regions import random_regions
 from vggtjax.training.truth import targets
@@ -98,3 +98,36 @@ def test_the_objective_suppresses_keys_as_a_second_pass_does(batch, trained, sup
     found = float(terms(trained, batch)["loss_translation"])
     assert found == pytest.approx(float(translation_loss(tokens)), rel=1e-5)
     assert abs(float(translation_loss(jnp.zeros_like(tokens))) - found) > 1e-5
+
+
+def test_moments_of_the_flow_by_hand():
+    place = np.array([[-0.5, -0.5], [0.5, -0.5], [-0.5, 0.5], [0.5, 0.5]], np.float32)[None, None]
+    flow = np.zeros((1, 2, 4, 2), np.float32)
+    flow[0, 1] = [[0.2, 0.0], [0.4, 0.0], [0.2, -0.1], [9.0, 9.0]]
+    depth_inverse = np.array([1.0, 2.0, 10.0, 1.0], np.float32)  # 10 counts as 4
+    seen = np.array([True, True, True, False])  # the flow of what is not seen does not count
+    made, known = _flow_moments(
+        jnp.asarray(flow),
+        jnp.asarray(place),
+        jnp.broadcast_to(jnp.asarray(depth_inverse), (1, 2, 4)),
+        jnp.broadcast_to(jnp.asarray(seen)[None, None, :, None], (1, 2, 4, 1)),
+    )
+    expected = [
+        [0.8 / 3, -0.1 / 3],  # flow
+        [(0.2 + 0.8 + 0.8) / 3, -0.4 / 3],  # times inverse depth
+        [(-0.1 + 0.2 - 0.1) / 3, 0.05 / 3],  # times x
+        [(-0.1 - 0.2 + 0.1) / 3, -0.05 / 3],  # times y
+        [7 / 3, 21 / 3],  # inverse depth and its square
+    ]
+    assert np.allclose(made[0, 1], np.ravel(expected), atol=1e-6)
+    assert np.allclose(made[0, 0, :8], 0)
+    assert known.all()
+
+
+def test_moments_of_too_few_patches_are_not_known():
+    seen = np.zeros((1, 1, 4, 1), bool)
+    seen[0, 0, :2] = True
+    zeros = jnp.zeros((1, 1, 4, 2))
+    made, known = _flow_moments(zeros, zeros, jnp.ones((1, 1, 4)), jnp.asarray(seen))
+    assert not known.any()
+    assert np.isfinite(made).all()

@@ -72,9 +72,8 @@ def test_gradients_are_clipped_together():
 def test_only_kernels_decay(kind):
     params = tree()
     gradient = jax.tree.map(jnp.ones_like, params)
-    updates, decayed = (
-        first_updates(recipe_with(kind=kind, weight_decay=decay), gradient, params) for decay in (0, 0.5)
-    )
+    recipes = [recipe_with(kind=kind, weight_decay=decay) for decay in (0, 0.5)]
+    updates, decayed = (first_updates(recipe, gradient, params) for recipe in recipes)
 
     def check(path, plain, decayed, param):
         expected = plain - 0.1 * 0.5 * param * (path[-1].key == "kernel")

@@ -180,11 +180,8 @@ def write_colmap(
         images.append((40 - frame, quaternion, -rotation @ centre, frame + 1, f"view_{8 + frame}.png"))
     model.mkdir(parents=True, exist_ok=True)
     if form == ".bin":
-        contents = {
-            "cameras": cameras_bin(cameras),
-            "images": images_bin(images),
-            "points3D": struct.pack("<Q", points),
-        }
+        contents = {"cameras": cameras_bin(cameras), "images": images_bin(images)}
+        contents["points3D"] = struct.pack("<Q", points)
     else:
         rows = [f"{number} PINHOLE {w} {h} {' '.join(map(str, values))}" for number, _, w, h, values in cameras]
         lines = ["# Image list", "#   IMAGE_ID, QW, ..."]

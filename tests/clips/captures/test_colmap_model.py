@@ -1,5 +1,3 @@
-"""COLMAP models byte by byte, and files that are none."""
-
 import struct
 
 import numpy as np

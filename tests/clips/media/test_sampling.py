@@ -1,5 +1,3 @@
-"""Which frames are taken: by index, by presentation time, and arguments that cannot work."""
-
 from typing import Any
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""Times of frames: in names, in lists, and what only looks like them."""
-
 from decimal import Decimal
 from pathlib import Path
 from typing import Any

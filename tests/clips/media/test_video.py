@@ -1,5 +1,3 @@
-"""Frames of video files: which, when, which way up, and files that break off."""
-
 import gc
 import struct
 
@@ -8,7 +6,7 @@ import numpy as np
 import pytest
 from av.stream import Disposition
 
-from tests.shared.videos import HEIGHT, WIDTH, picture, write_video
+from tests.shared.videos import HEIGHT, WIDTH, encode, picture, write_video
 from vggtjax.clips.media.sampling import Sampling
 from vggtjax.clips.media.video import VideoFile, upright
 from vggtjax.errors import ClipError
@@ -182,11 +180,7 @@ def test_what_is_transparent_is_white_as_in_pictures(tmp_path, codec, pixels):
     path = tmp_path / "a.mov"
     colours = np.dstack([picture(5), np.full((HEIGHT, WIDTH), 255, np.uint8)])
     colours[:, WIDTH // 2 :, 3] = 0
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream(codec, rate=10)
-        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, pixels
-        container.mux(stream.encode(av.VideoFrame.from_ndarray(colours, format="rgba").reformat(format=pixels)))
-        container.mux(stream.encode())
+    encode(path, [colours], codec, pixels)
     frame = np.asarray(read(path)[0].image).astype(int)
     is_clear = codec != "png"
     np.testing.assert_allclose(frame[:, WIDTH // 2 + 4 :], 255 if is_clear else picture(5)[:, WIDTH // 2 + 4 :], atol=6)

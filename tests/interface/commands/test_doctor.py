@@ -1,5 +1,3 @@
-"""What `vggtjax doctor` prints, and the cache that it clears."""
-
 import json
 import re
 from functools import partial
@@ -108,16 +106,8 @@ def test_the_weights_of_a_loaded_model_are_counted_once(monkeypatch):
 def test_the_page_clears_the_cache_of_this_library_alone(cache, capsys):
     assert cli.main(["doctor", "--clear-cache"]) == 0
     page = capsys.readouterr().out
-    for words in (
-        str(cache),
-        "in all",
-        "VGGTJAX_CACHE=FOLDER",
-        "vggtjax doctor --clear-cache",
-        "Longest clip that is run at once",
-        "VGGT-1B, bfloat16",
-        "installed  vggtjax train",
-        "cleared",
-    ):
+    said = "in all; VGGTJAX_CACHE=FOLDER; Longest clip that is run at once; VGGT-1B, bfloat16; installed  vggtjax train"
+    for words in (str(cache), "vggtjax doctor --clear-cache", "cleared", *said.split("; ")):
         assert words in page
     assert [path.name for path in cache.iterdir()] == ["mine.safetensors"]
     assert clear_cache() == 0

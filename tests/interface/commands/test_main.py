@@ -1,5 +1,3 @@
-"""The command line: what it writes, what it says, and its exit codes."""
-
 import json
 import re
 import shutil

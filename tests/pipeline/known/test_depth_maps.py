@@ -1,4 +1,4 @@
-"""A folder of metric depth maps, as depth models and lidars write them, gives a clip its metres."""
+"""Metric scale: by folders of depth maps as depth models and lidars write them, by single depths, or a baseline."""
 
 from typing import Any
 
@@ -142,3 +142,60 @@ def test_options_without_depths_are_refused():
             KnownGeometry(**options)
     with pytest.raises(InputError, match=r"depths_per_metre is 0\.0; expected a number above 0"):
         KnownGeometry(known_depths="maps", depths_per_metre=0)
+
+
+ROOM = make_room(frames=5)
+QUARTER = scaled(ROOM, 0.25)
+
+
+def check_scale(known):
+    found, unit = apply_known(QUARTER, read_known(known, QUARTER))
+    assert unit == pytest.approx(4, rel=1e-4)
+    np.testing.assert_allclose(found.depth, ROOM.depth, rtol=1e-4)
+    np.testing.assert_allclose(found.camera_centres, ROOM.camera_centres, atol=1e-4)
+    assert found.length_unit == "metre"
+    assert found.known_facts["scale"].startswith("4 metres per unit")
+
+
+def test_known_depths_give_the_scale_despite_an_outlier(tmp_path):
+    lines = [f"{i},{2 * x + 1},{2 * y + 1},{ROOM.depth[i, y, x]}" for i, x, y in ((0, 3, 4), (2, 8, 2), (4, 5, 9))]
+    (tmp_path / "depths.csv").write_text("\n".join(["frame,x,y,depth", *lines, "1,3,3,900", ""]))
+    check_scale(KnownGeometry(known_depths=str(tmp_path / "depths.csv")))
+
+
+def test_a_baseline_gives_the_scale():
+    metres = np.linalg.norm(ROOM.camera_centres[1] - ROOM.camera_centres[4])
+    check_scale(KnownGeometry(baseline=f"1,4,{metres}"))
+    still = make_room(frames=5, camera_from_world=np.tile(QUARTER.camera_from_world[:1], (5, 1, 1)))
+    with pytest.raises(InputError, match=r"frames 0 and 2 are predicted .* median depths apart, which is no motion"):
+        apply_known(still, read_known(KnownGeometry(baseline="0,2,1"), still))
+
+
+def over_a_floor():
+    """Return level cameras 1.6 above a floor that fills the lower half of the picture; the rest is 20 away."""
+    poses = np.tile(np.eye(3, 4), (5, 1, 1))
+    poses[:, 0, 3] = -np.arange(5) / 5
+    y = (np.arange(28) + 0.5 - 14) / ROOM.intrinsics[0, 1, 1]
+    depth = np.where(y > 0.08, 1.6 / np.maximum(y, 0.08), 20)[None, :, None] + np.zeros(ROOM.depth.shape)
+    return make_room(frames=5, camera_from_world=poses, depth=depth, dynamic_mask=np.zeros(depth.shape, bool))
+
+
+def test_the_height_above_the_floor_gives_the_scale():
+    true, known = over_a_floor(), KnownGeometry(camera_height=1.6)
+    small = scaled(true, 0.25)
+    found, unit = apply_known(small, read_known(known, small))
+    assert unit == pytest.approx(4, rel=1e-5)
+    np.testing.assert_allclose(found.depth, true.depth, rtol=1e-5)
+    with pytest.raises(InputError, match="finds no floor"):
+        apply_known(ROOM, read_known(known, ROOM))  # it shows a wall
+
+
+def test_depths_that_do_not_fit_are_refused(tmp_path):
+    for text, message in (
+        ("frame,x,y\n0,1,1\n", "line 2 is .* expected columns frame, x, y and depth"),
+        ("frame,x,y,depth\n9,1,1,1\n", "line 2 is .* a frame of 0 to 4"),
+        ("frame,x,y,depth\n0,99,1,1\n", r"line 2: \(99, 1\) lies outside .* a picture of 84 x 56 pixels"),
+    ):
+        (tmp_path / "depths.csv").write_text(text)
+        with pytest.raises(InputError, match=message):
+            apply_known(QUARTER, read_known(KnownGeometry(known_depths=str(tmp_path / "depths.csv")), QUARTER))

@@ -1,15 +1,15 @@
-"""Known poses: their files, and a result that takes them."""
+"""Known poses: their files, a result that takes them, and the depth and focal length that agree with them."""
 
 import numpy as np
 import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from tests.shared.room import make_room
-from tests.shared.textured_room import textured_room
+from tests.shared.room import make_room, textured_room
 from vggtjax import load_clip
 from vggtjax.errors import InputError
 from vggtjax.pipeline.known.apply import apply_known
+from vggtjax.pipeline.known.consistency import consistent_with_poses
 from vggtjax.pipeline.known.given import check_readable, read_known
 from vggtjax.pipeline.known.options import KnownGeometry
 from vggtjax.pipeline.known.poses import read_poses
@@ -180,3 +180,31 @@ def test_files_that_are_no_poses(tmp_path, text, message):
     (tmp_path / "p.txt").write_text(text)
     with pytest.raises(InputError, match=message):
         read_poses(tmp_path / "p.txt", ROOM)
+
+
+TEXTURED = textured_room(4)
+STATIC = ~TEXTURED.dynamic_mask
+
+
+def test_what_is_right_stays_as_it_is():
+    broken = np.where(TEXTURED.dynamic_mask, np.float32(30), TEXTURED.depth)  # movers do not count
+    made = consistent_with_poses(textured_room(4, depth=broken), focal_known=False)
+    assert made.focal == 1
+    np.testing.assert_array_equal(made.depth[STATIC], 1)
+
+
+def test_one_scale_and_a_smooth_distortion_are_undone():
+    across = np.linspace(-1, 1, 84)
+    distorted = textured_room(4, depth=TEXTURED.depth * 1.5 * np.exp(0.35 * across).astype(np.float32))
+    made = consistent_with_poses(distorted, focal_known=True)
+    left = np.abs(made.depth * distorted.depth / TEXTURED.depth - 1)[STATIC]
+    assert left.mean() < 0.05
+    assert made.cost[1] < made.cost[0]
+
+
+@pytest.mark.proof
+def test_a_wrong_focal_length_is_found():
+    wrong = textured_room().intrinsics.copy()
+    wrong[:, [0, 1], [0, 1]] *= 1.2
+    made = consistent_with_poses(textured_room(intrinsics=wrong), focal_known=False)
+    assert made.focal == pytest.approx(1 / 1.2, rel=0.04)

@@ -1,10 +1,6 @@
-"""The field of log scale: against a slow reference, and with wrong measurements."""
-
 import numpy as np
-from hypothesis import given
-from hypothesis import strategies as st
 
-from vggtjax.pipeline.refinement.field import FieldPrior, Measured, at_pixels, fit_field, grid_shape
+from vggtjax.pipeline.refinement.field import FieldPrior, Measured, at_pixels, fit_field
 
 
 def measured(function, count, frame=0, seed=0, precision=400.0):
@@ -44,10 +40,3 @@ def test_a_quarter_of_wrong_measurements_hardly_moves_it():
     mixed = right._replace(log_ratio=np.where(wrong, 1.5, right.log_ratio))
     fields = fit_field(mixed, 1, (20, 20), FieldPrior(robust=0.1))
     assert np.abs(fields - 0.1).max() < 0.03
-
-
-@given(st.integers(1, 2000), st.integers(1, 2000), st.integers(2, 20))
-def test_grids_have_square_cells_and_at_least_two_nodes_a_side(height, width, nodes):
-    rows, columns = grid_shape((height, width), nodes)
-    assert max(rows, columns) == nodes
-    assert min(rows, columns) >= 2

@@ -1,11 +1,15 @@
-"""Which frames each window has."""
-
+from collections.abc import Iterator
 from itertools import pairwise
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.shared.videos import write_video
+from vggtjax.clips.media.sampling import Frame, Sampling
+from vggtjax.clips.media.video import VideoFile
+from vggtjax.clips.preprocessing import Fitter
+from vggtjax.pipeline.windows.frames import count_frames, window_clips
 from vggtjax.pipeline.windows.plan import Windows, blend_weights, plan_windows, shared_frames
 
 
@@ -37,3 +41,26 @@ def test_weights_of_a_frame_sum_to_one_and_fall_towards_the_end_of_a_window(wind
     for a, b in zip(range(len(windows)), range(1, len(windows)), strict=False):
         both = [weights[a] - weights[b] for weights in table if set(weights) == {a, b}]
         assert both == sorted(both, reverse=True)
+
+
+class Watched(VideoFile):
+    """A video that counts the frames it decoded."""
+
+    decoded = 0
+
+    def frames(self, sampling: Sampling) -> Iterator[Frame]:
+        for frame in super().frames(sampling):
+            Watched.decoded += 1
+            yield frame
+
+
+def test_frames_of_a_video_are_decoded_when_their_window_is_due(tmp_path):
+    video = Watched(write_video(tmp_path / "clip.mp4", range(0, 2000, 100)))
+    cut = plan_windows(20, 8, 2)
+    Watched.decoded = 0
+    for window, clip in zip(cut, window_clips(video, Sampling(), Fitter(size=64, patch=8), cut), strict=True):
+        assert Watched.decoded == window.stop
+        assert clip.frame_names == [f"{number:06d}" for number in window]
+    Watched.decoded = 0
+    assert count_frames(video, Sampling(), most=5) == Watched.decoded == 5
+    assert count_frames(video, Sampling(stride=2)) == 10

@@ -70,11 +70,6 @@ def make_sweep(seed, truth, depth=3):
     return Sweep(maps, truth, MotionConfig(), saliency, np.zeros((depth, len(truth)), np.float32))
 
 
-def random_truth(seed, shape=(4, 3, 20)):
-    kinds = [STATIC, DYNAMIC, sweeps.UNCLEAR]
-    return np.random.default_rng(seed).choice(kinds, shape, p=(0.6, 0.3, 0.1)).astype(np.int8)
-
-
 @partial(jax.jit, static_argnames="cues")
 def add_all(cues, q, k):
     def pair(sums, layer):
@@ -138,7 +133,8 @@ def test_unclear_tokens_do_not_count():
 
 
 def test_a_planted_map_is_chosen_first():
-    truth = random_truth(0)
+    kinds, generator = [STATIC, DYNAMIC, sweeps.UNCLEAR], np.random.default_rng(0)
+    truth = generator.choice(kinds, (4, 3, 20), p=(0.6, 0.3, 0.1)).astype(np.int8)
     planted = make_sweep(1, truth)
     planted.maps[0, 3, 1] = -1 * (truth == DYNAMIC)  # of similarity "cosine" only
     chosen = choose(planted)

@@ -1,5 +1,3 @@
-"""Where other projects' frames lie in the pictures they came from."""
-
 import dataclasses
 
 import numpy as np

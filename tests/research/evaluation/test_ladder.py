@@ -83,9 +83,8 @@ def test_every_setting_has_a_row(rows):
     sources, pairs = ("mined", "true"), (0, 2)
     masked = [(name, source, number, "zero") for source in sources for number in pairs for name in ABLATION[1:]]
     settings = [("vggt", None, None, None), *masked]
-    assert [(row.clip, *(getattr(row, name) for name in SETTING)) for row in rows] == [
-        (clip, *setting) for clip in range(CLIPS) for setting in settings
-    ]
+    found = [(row.clip, *(getattr(row, name) for name in SETTING)) for row in rows]
+    assert found == [(clip, *setting) for clip in range(CLIPS) for setting in settings]
     assert not any(row.failure for row in rows)
 
 

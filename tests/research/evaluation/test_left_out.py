@@ -1,5 +1,3 @@
-"""Frames that lack something are left out and named; the others are scored."""
-
 import dataclasses
 import json
 import sys
@@ -51,14 +49,10 @@ def scored(folder, result, *arguments, capsys):
     return code, out + err, json.loads((root / "out/results.json").read_text())["sequences"][0]
 
 
-def rows(folder):
-    return (folder / "world_from_camera.txt").read_text().splitlines()
-
-
 @pytest.mark.parametrize("lost", [["-inf"] * 16, ["nan"] * 16, ["0"] * 16])
 def test_a_pose_that_is_not_finite_leaves_its_frame_out(walk, capsys, lost):
     folder, result = walk
-    poses = rows(folder)
+    poses = (folder / "world_from_camera.txt").read_text().splitlines()
     poses[1] = " ".join(lost)
     (folder / "world_from_camera.txt").write_text("\n".join(poses))
     code, shown, record = scored(folder, result, capsys=capsys)

@@ -1,5 +1,3 @@
-"""Sources of results: what they depend on, and what they refuse."""
-
 import dataclasses
 from pathlib import Path
 

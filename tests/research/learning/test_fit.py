@@ -151,9 +151,8 @@ def test_a_soft_mask_is_recovered():
     seen = Observations(d1, zero, d2, zero, (margin >= 0).astype(jnp.float32), margin, jnp.zeros((*shape, 4)))
     true = paper_rule() | {"offset": jnp.asarray(0.1), "temperature": jnp.asarray(0.05)}
     truth = fused(true, seen).depth + 0.02 * jnp.asarray(generator.normal(size=shape), jnp.float32)
-    config = FitConfig(
-        parse_family("scale+offset+temperature"), steps=STEPS, learning_rate=0.2, patience=60, clips_at_once=4
-    )
+    family = parse_family("scale+offset+temperature")
+    config = FitConfig(family, steps=STEPS, learning_rate=0.2, patience=60, clips_at_once=4)
     clips = FitClips(seen, truth)
     fit = fit_fusion(clips.taken(np.arange(8)), clips.taken(np.arange(8, 12)), config)
     assert float(fit.params["offset"]) == pytest.approx(0.1, abs=0.01)

@@ -1,5 +1,3 @@
-"""The data set for dynamic splats, read back by the readers of its two layouts."""
-
 import json
 from typing import Any
 

@@ -85,7 +85,8 @@ def test_tracks_of_the_result_are_the_observations_of_colmap(tmp_path, result, p
     inside = np.column_stack([query, np.ones(3)]) @ np.linalg.inv(result.intrinsics[1]).T
     inside *= result.depth[1, rows, columns, None]
     world = (inside - result.camera_from_world[1, :, 3]) @ result.camera_from_world[1, :, :3]
-    positions = np.stack([np.column_stack(project(world, pose, K)[:2]) for pose, K in cameras_of(result)])
+    cameras = zip(result.camera_from_world.astype(float), result.intrinsics.astype(float), strict=True)
+    positions = np.stack([np.column_stack(project(world, pose, K)[:2]) for pose, K in cameras])
     positions[3, 0] += (0, 3)
     moving = np.argwhere(result.dynamic_mask[1])[0][::-1] + 0.5
     positions = np.concatenate([positions, np.broadcast_to(moving, (FRAMES, 1, 2))], axis=1)
@@ -105,10 +106,6 @@ def test_tracks_of_the_result_are_the_observations_of_colmap(tmp_path, result, p
     (wrong,) = [point for point in measured if point.error > 0.01]
     np.testing.assert_allclose(wrong.error, (2 if original else 1) * 3 / inside[:, 0].sum(), rtol=1e-3)
     assert any(point.error == -1 for point in model.points3D.values())
-
-
-def cameras_of(result):
-    return zip(result.camera_from_world.astype(float), result.intrinsics.astype(float), strict=True)
 
 
 def test_each_frame_of_the_animation_shows_its_own_points(tmp_path, result):

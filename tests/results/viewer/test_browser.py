@@ -76,13 +76,6 @@ def set_slider(page, name, value):
     page.locator(name).evaluate("(one, value) => { one.value = value; one.dispatchEvent(new Event('input')) }", value)
 
 
-def look_through_the_clips_camera(page):
-    """The scene then is the picture."""
-    set_slider(page, "#least-moving", 0)
-    page.locator("#pictures").evaluate("box => box.click()")
-    page.keyboard.press("f")
-
-
 def open_page(page, folder, results, **options):
     file = folder / "viewer.html"
     file.write_text(viewer_page(results, **options), encoding="utf-8")
@@ -100,7 +93,9 @@ def test_the_page_opens_from_a_file_plays_and_shows_the_frame_that_is_due(page, 
     page.keyboard.press("Space")
     assert not page.evaluate("window.vggtjax.viewer.playing")
 
-    look_through_the_clips_camera(page)
+    set_slider(page, "#least-moving", 0)
+    page.locator("#pictures").evaluate("box => box.click()")
+    page.keyboard.press("f")  # through the clip's camera the scene is the picture
     for frame in (0, FRAMES // 2, FRAMES - 1):
         set_slider(page, "#time", frame)
         assert agreement(red(page), room.dynamic_mask[frame]) > 0.75

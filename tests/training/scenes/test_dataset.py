@@ -13,7 +13,7 @@ from vggtjax.errors import InputError, OutputError
 from vggtjax.interface.commands.scenes import Images, scenes
 from vggtjax.research.evaluation.datasets import find_sequences
 from vggtjax.storage.trajectories import read_trajectory
-from vggtjax.training.scenes import SceneConfig, dataset, generate, load_textures
+from vggtjax.training.scenes import SceneConfig, dataset, generate
 from vggtjax.training.scenes.dataset import read_index, write_scenes
 
 S, H, W = 3, 24, 32
@@ -22,24 +22,19 @@ CONFIG = SceneConfig(height=H, width=W, frames=S, dynamic=1.0, samples=2)
 quick = jax.jit(generate, static_argnums=2, compiler_options=QUICK)
 
 
-@pytest.fixture(autouse=True)
-def quickly_compiled(monkeypatch):
-    monkeypatch.setattr(dataset, "_draw", quick)
-    monkeypatch.setattr(dataset, "load_textures", kept_textures)
-
-
-def kept_textures(split):
-    return textures() if split == "training" else load_textures(split)
+@pytest.fixture(scope="module", autouse=True)
+def quickly_compiled():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(dataset, "_draw", quick)
+        patch.setattr(dataset, "load_textures", {"training": textures()}.__getitem__)
+        yield
 
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
     """A set of two scenes, by the command."""
     out = tmp_path_factory.mktemp("sets") / "new" / "set"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(dataset, "_draw", quick)
-        patch.setattr(dataset, "load_textures", kept_textures)
-        scenes(out, count=2, images=Images(frames=S, height=H, width=W), seed=3)
+    scenes(out, count=2, images=Images(frames=S, height=H, width=W), seed=3)
     return out
 
 

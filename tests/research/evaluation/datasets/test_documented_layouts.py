@@ -3,7 +3,6 @@
 import json
 import re
 from collections.abc import Iterator
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -16,16 +15,9 @@ from vggtjax.research.evaluation.datasets import DATASETS
 
 PAGE = (DOCS / "reference" / "evaluation-protocols.md").read_text()
 ROW = "1 0 0 0 0 1 0 0 0 0 1 0"
-TRANSFORMS = {
-    **{"w": 4, "h": 3, "fl_x": 4.0, "fl_y": 4.0, "cx": 2.0, "cy": 1.5, "camera_model": "PINHOLE"},
-    "frames": [
-        {
-            "file_path": "images/frame_00001.png",
-            "depth_file_path": "depth/frame_00001.png",
-            "transform_matrix": np.eye(4).tolist(),
-        }
-    ],
-}
+_FRAME = {"file_path": "images/frame_00001.png", "depth_file_path": "depth/frame_00001.png"}
+_CAMERA = {"w": 4, "h": 3, "fl_x": 4.0, "fl_y": 4.0, "cx": 2.0, "cy": 1.5, "camera_model": "PINHOLE"}
+TRANSFORMS = _CAMERA | {"frames": [_FRAME | {"transform_matrix": np.eye(4).tolist()}]}
 K = [[4.0, 0, 1.5], [0, 4.0, 1], [0, 0, 1]]
 
 
@@ -83,11 +75,6 @@ def paths(tree: str) -> Iterator[str]:
             yield "".join(folders)
 
 
-def build(root: Path, tree: str) -> None:
-    for path in paths(tree):
-        write(root / path, next(content for end, content in CONTENTS.items() if re.search(f"(?:{end})$", f"/{path}")))
-
-
 CASES = [
     pytest.param(name, layout, gt, id=f"{name} {gt}{number}")
     for number, layout in enumerate(layouts())
@@ -104,7 +91,9 @@ def test_every_data_set_has_a_tree():
 @pytest.mark.filterwarnings("ignore")
 def test_files_of_a_tree_are_a_data_set(name, layout, gt, tmp_path):
     """With all the ground truth that the data set has."""
-    build(tmp_path, layout.tree)
+    for path in paths(layout.tree):
+        content = next(content for end, content in CONTENTS.items() if re.search(f"(?:{end})$", f"/{path}"))
+        write(tmp_path / path, content)
     roots = ["", *re.findall(r"`ROOT/([\w/-]+)`", layout.says.split(" too")[0])]
     for root in roots:
         (sequence,) = opened(name, tmp_path / root, gt=gt, stride=1)

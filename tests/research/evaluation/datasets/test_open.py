@@ -1,5 +1,3 @@
-"""Opening data sets: what is taken and what is noted, and plain folders."""
-
 import logging
 import shutil
 

@@ -1,5 +1,3 @@
-"""TUM RGB-D and Bonn: files, associations of times, windows."""
-
 import numpy as np
 import pytest
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from tests.test_similarity import random_similarity
+from tests.test_cameras import random_similarity
 from vggtjax.errors import InputError
 from vggtjax.research.evaluation.metrics.trajectory import associate, centre_error, rotation_error, trajectory_errors
 from vggtjax.similarity import align, centres, umeyama_sim3
@@ -21,10 +21,6 @@ def cameras(points, rotation=None) -> np.ndarray:
 
 def still(frames) -> np.ndarray:
     return cameras(np.zeros((frames, 3)))
-
-
-def random_cameras(generator, frames=7) -> np.ndarray:
-    return cameras(generator.normal(size=(frames, 3)), Rotation.random(frames, rng=generator))
 
 
 def about(axis, degrees) -> Rotation:

@@ -1,5 +1,3 @@
-"""Claimed precision against errors: hand-computed values, properties, other definitions of the same."""
-
 import numpy as np
 import pytest
 
