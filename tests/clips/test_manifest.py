@@ -1,5 +1,3 @@
-"""Lists of clips: names, paths, and a sentence with the line for what is wrong."""
-
 import pyarrow as pa
 import pytest
 from pyarrow import parquet

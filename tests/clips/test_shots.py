@@ -74,8 +74,7 @@ LONG = place(1, 9)
 )
 def test_frames_that_are_no_part_of_the_scene(pictures, blank, flashes, shots):
     found = find_shots([look_at(Image.fromarray(picture)) for picture in pictures])
-    assert found.blank == blank
-    assert found.flashes == flashes
+    assert (found.blank, found.flashes) == (blank, flashes)
     assert [(shot.start, shot.stop) for shot in found.shots] == shots
 
 

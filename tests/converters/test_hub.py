@@ -1,5 +1,3 @@
-"""Weights by hub id, from a server on this machine that answers as the hub does."""
-
 import hashlib
 import json
 import re

@@ -1,5 +1,3 @@
-"""Where the commands compute in bfloat16 by themselves: a unit of the processor, a trial, and a sentence."""
-
 from typing import Any
 
 import jax

@@ -1,15 +1,23 @@
-"""Several methods at once, as one by one; and arguments of another class than their own."""
+"""Several methods as one by one, the plain first pass, which makes no mask, and arguments of another class."""
 
+import dataclasses
 from contextlib import contextmanager
 
 import numpy as np
 import pytest
 
+from tests.shared.scored_room import room_and_truth
 from tests.shared.tiny import tiny_model
-from vggtjax import Options, reconstruct
+from vggtjax import load_clip
 from vggtjax.errors import InputError
-from vggtjax.pipeline.run import compile_ahead
+from vggtjax.options import Options
+from vggtjax.pipeline.run import compile_ahead, reconstruct, with_own_mask
+from vggtjax.pipeline.running import Running
 from vggtjax.pipeline.several import reconstruct_methods
+from vggtjax.progress import StageSeconds
+from vggtjax.research.evaluation.protocol import score
+from vggtjax.research.evaluation.truth_at_pixels import TruthAtPixels
+from vggtjax.results.reconstruction import Reconstruction
 
 METHODS = ("4dvggt-d", "vggt4d")
 
@@ -53,3 +61,60 @@ def test_arguments_in_the_wrong_place_are_named():
     ):
         with pytest.raises(InputError, match=message):
             run()
+
+
+@pytest.fixture(scope="module")
+def small(model):
+    images = np.random.default_rng(3).integers(0, 255, (4, 28, 42, 3), np.uint8)
+    return load_clip(images, model=model, size=42)
+
+
+def test_a_result_of_one_pass_has_no_mask_and_the_same_depth_and_cameras(model, small, tmp_path):
+    stages = StageSeconds()
+    alone = reconstruct(model, small, method="vggt", size=42, on_stage=stages.stage)
+    assert "first pass" in stages.seconds
+    assert "dynamic mask" not in stages.seconds
+    used = with_own_mask(model, small, Options("vggt"), Running(), size=42)
+    both = reconstruct_methods(model, small, ["vggt", "4dvggt-d"], size=42)
+    assert used.dynamic_mask.any()
+    for result in (alone, both["vggt"]):
+        assert not result.has_mask
+        assert not result.dynamic_mask.any()
+        assert result.saliency is result.motion is None
+        assert result.settings["masks"] == "none: vggt makes no mask"
+        assert repr(result).endswith("no mask)")
+    for name in ("depth", "depth_confidence", "camera_from_world", "intrinsics"):
+        np.testing.assert_array_equal(getattr(alone, name), getattr(used, name))
+    assert both["4dvggt-d"].has_mask
+    np.testing.assert_array_equal(both["4dvggt-d"].dynamic_mask, used.dynamic_mask)
+
+    alone.save(tmp_path / "out", format="vggt4d")
+    there = {path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*")}
+    assert not [name for name in there if "mask" in name or "instances" in name or "overlay" in name]
+    assert not Reconstruction.load(tmp_path / "out").has_mask
+    assert not Reconstruction.load(tmp_path / "out/vggt4d", format="vggt4d", quaternion="wxyz").has_mask
+    page = (tmp_path / "out/report.html").read_text()
+    assert "of the pixels," not in page
+    assert "plain values stand" not in page
+
+
+@pytest.mark.parametrize("empty", [False, True])
+def test_masks_that_are_given_stay(model, small, empty):
+    given = np.zeros(small.images.shape[:3], bool)
+    given[:, :14, :14] = not empty
+    result = reconstruct(model, small, method="vggt", size=42, masks=given)
+    assert result.has_mask
+    np.testing.assert_array_equal(result.dynamic_mask, given)
+    assert not reconstruct(model, small, method="vggt", size=42, refine_mask=True).has_mask
+
+
+def test_neither_new_nor_older_results_of_one_pass_get_j_and_f():
+    room, sequence = room_and_truth()
+    for masks, scored in (("mined", False), ("none: vggt makes no mask", False), ("given", True)):
+        result = dataclasses.replace(room, method="vggt", settings={"masks": masks})
+        scores = score(result, TruthAtPixels(sequence, room))
+        assert ("j_mean" in scores.metrics) == ("saliency_auc" in scores.metrics) == scored
+        assert ("masks: the result has no masks" in scores.notes) == (not scored)
+        assert scores.metrics["ate"] < 1e-4
+    other = dataclasses.replace(room, method="4dvggt-d", settings={"masks": "mined"})
+    assert score(other, TruthAtPixels(sequence, room)).metrics["j_mean"] == 1

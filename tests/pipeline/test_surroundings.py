@@ -1,5 +1,3 @@
-"""Settings that a program makes for its own code change no result and break no run."""
-
 from functools import partial
 
 import jax

@@ -1,5 +1,6 @@
 """The truth of a small room, written as other programs write their results."""
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -88,13 +89,9 @@ def rearrange(folder):
         (folder / "before" / name).rename(folder / name)
 
 
-def write_as_monst3r(folder):
-    write_flat(folder, padded=False, logarithmic=True)
-
-
 WRITERS = {
-    "vggt4d": lambda folder: write_flat(folder, padded=True, logarithmic=False),
-    **dict.fromkeys(("monst3r", "easi3r", "das3r", "pomato"), write_as_monst3r),
+    "vggt4d": partial(write_flat, padded=True, logarithmic=False),
+    **dict.fromkeys(("monst3r", "easi3r", "das3r", "pomato"), partial(write_flat, padded=False, logarithmic=True)),
     "cut3r": write_cut3r,
     "da3": write_da3,
     "spatialtrackerv2": write_spatialtracker,

@@ -1,5 +1,3 @@
-"""Result folders of other projects, written here as their public code writes them."""
-
 import logging
 
 import numpy as np

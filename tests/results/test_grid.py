@@ -1,5 +1,3 @@
-"""The grid of all sheets: a place for each picture, room for the title; and colours beside those of matplotlib."""
-
 import matplotlib as mpl
 import numpy as np
 import pytest

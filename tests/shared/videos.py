@@ -20,21 +20,14 @@ def picture(index: int) -> np.ndarray:
     return pixels
 
 
-def encode(
-    path: Path,
-    pictures: Iterable[np.ndarray],
-    codec: str = "mpeg4",
-    pixels: str = "yuv420p",
-    *,
-    bits: int = 0,
-    **options,
-) -> Path:
+def encode(path: Path, pictures: Iterable[np.ndarray], codec="mpeg4", pixels="yuv420p", *, bits=0, **options) -> Path:
     """Write pictures [H, W, 3 or 4] by a codec, 25 a second; `bits` a second, and options of the codec."""
     with av.open(str(path), "w") as container:
         stream: Any = container.add_stream(codec, rate=25, options=options)
-        for number, values in enumerate(pictures):
-            stream.height, stream.width = values.shape[:2]
-            stream.pix_fmt, stream.bit_rate = pixels, bits
+        first, *others = pictures
+        stream.height, stream.width = first.shape[:2]
+        stream.pix_fmt, stream.bit_rate = pixels, bits
+        for number, values in enumerate((first, *others)):
             frame = av.VideoFrame.from_ndarray(values, format="rgb24" if values.shape[2] == 3 else "rgba")
             frame = frame.reformat(format=pixels)
             frame.pts = number

@@ -12,15 +12,8 @@ from pathlib import Path
 import pytest
 
 from vggtjax.errors import OutputError
-from vggtjax.storage.writing import (
-    _remove_leftovers,
-    check_free,
-    locked_folder,
-    says_format,
-    staging,
-    write_errors,
-    writing,
-)
+from vggtjax.storage import writing as module
+from vggtjax.storage.writing import _remove_leftovers, check_free, locked_folder, staging, write_errors, writing
 
 WRITER = """
 import sys, time
@@ -168,7 +161,7 @@ def test_an_error_names_what_is_in_the_way(tmp_path):
 @pytest.mark.parametrize(("text", "says"), [('{"format": "clip"}', True), ('{"format": "mask"}', False), ("[", False)])
 def test_a_file_says_its_format(tmp_path, text, says):
     (tmp_path / "a.json").write_text(text)
-    assert says_format(tmp_path / "a.json", "clip") is says
+    assert module.says_format(tmp_path / "a.json", "clip") is says
 
 
 def test_a_check_finds_files_that_may_not_be_replaced_and_leaves_nothing(tmp_path):

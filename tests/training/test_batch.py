@@ -60,7 +60,7 @@ def test_regions_are_compact_and_move():
     assert shares.max() < 2 * 0.7**2
     assert np.mean(np.any(regions[:, 0] != regions[:, -1], axis=(1, 2))) > 0.95
     rims = regions[:, :, [0, -1]].any((1, 2, 3)) | regions[..., [0, -1]].any((1, 2, 3))
-    alone = regions[regions.any((2, 3)).all(axis=1) & ~rims]
+    alone = regions[regions.any((2, 3)).all(-1) & ~rims]
     centres = np.array([[ndimage.center_of_mass(frame) for frame in clip] for clip in alone])
     assert len(alone) > 2
     assert np.abs(np.diff(centres, 2, axis=1)).max() < 1.5

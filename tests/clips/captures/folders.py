@@ -201,11 +201,6 @@ def colmap_text(folder: Path, truth: Truth, model: str = "sparse/0", form: str =
     return folder
 
 
-def colmap_binary(folder: Path, truth: Truth) -> Path:
-    """The same model as COLMAP writes it by default, without points."""
-    return colmap_text(folder, truth, form=".bin")
-
-
 def tum(folder: Path, truth: Truth) -> Path:
     """https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats: pixels count from the centre of the first."""
     lists = {"rgb": ["# color images"], "depth": ["# depth maps"]}

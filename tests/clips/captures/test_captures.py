@@ -114,8 +114,7 @@ def test_polycam_s_own_cameras_stand_in_for_optimised_ones(tmp_path):
     edited(first, k1=0.1, p2=0.01)
     K = TRUTH.intrinsics[0] if first.stem == capture.frame_names[0] else None
     lens = next(filter(None, read(tmp_path).lenses))
-    assert lens.model == "OPENCV"
-    assert lens.params[4:] == (0.1, 0, 0, 0.01)
+    assert (lens.model, lens.params[4:]) == ("OPENCV", (0.1, 0, 0, 0.01))
     assert K is None or lens.params[:4] == (K[0, 0], K[1, 1], K[0, 2], K[1, 2])
 
 
@@ -207,8 +206,7 @@ def test_pictures_that_are_not_there_do_not_count_and_a_broken_model_is_no_choic
 def test_frames_keep_their_cameras_by_name(tmp_path):
     folder = write("nerfstudio", tmp_path / "scene")
     clip = load_clip(folder, size=28, patch=14, start=1, stride=2)
-    assert clip.frame_names == ["frame_9", "frame_11"]
-    assert clip.source.name == "scene"
+    assert (clip.frame_names, clip.source.name) == (["frame_9", "frame_11"], "scene")
     chosen = read(folder).for_frames(reversed(clip.frame_names))
     np.testing.assert_array_equal(chosen.intrinsics, TRUTH.intrinsics[[3, 1]])
     np.testing.assert_allclose(chosen.world_from_camera, TRUTH.world_from_camera[[3, 1]])

@@ -198,7 +198,7 @@ ROWS = (
     _capture("Polycam", folders.polycam),
     _capture("nerfstudio", folders.nerfstudio),
     _capture("COLMAP", folders.colmap_text),
-    _capture("COLMAP, binary", folders.colmap_binary),
+    _capture("COLMAP, binary", partial(folders.colmap_text, form=".bin")),
     _capture("TUM", folders.tum),
     _data_set("plain", plain_folder),
     _data_set("tum", partial(_tum, frames=4.0)),

@@ -50,8 +50,7 @@ def test_a_second_run_adds_a_sequence_and_does_nothing_again(sequences, evaluate
     for metric in needed - of_masks - {"abs_rel"}:
         each = [e["metrics"][metric] for e in values["sequences"] if e["method"] == "vggt"]
         assert values["mean"]["vggt"][metric] == pytest.approx(np.mean(each))
-    assert values["settings"]["dataset"] == "plain"
-    assert values["settings"]["model"]["name"] == "demo"
+    assert (values["settings"]["dataset"], values["settings"]["model"]["name"]) == ("plain", "demo")
     assert "The model demo is a small demonstration model" in (evaluated / "index.html").read_text()
     assert not list(evaluated.rglob(".vggtjax-partial*"))
 

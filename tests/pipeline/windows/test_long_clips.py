@@ -10,17 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.pipeline.windows.walk import (
-    CONFIG,
-    FRAMES,
-    SETTINGS,
-    movers,
-    plan_of,
-    tools_of,
-    walk,
-    window_result,
-    windows_of,
-)
+from tests.pipeline.windows import walk as walks
+from tests.pipeline.windows.walk import CONFIG, FRAMES, movers, walk, window_result
 from tests.shared.contents import contents
 from vggtjax.errors import ClipError, InputError, OutputError
 from vggtjax.pipeline.windows.run import run_windows
@@ -38,7 +29,8 @@ def exact(clip) -> Reconstruction:
 
 def reconstructed(out, run, *, loops=False, masks=True, source=None) -> Reconstruction:
     images = np.asarray(walk().images) if source is None else source
-    return run_windows(images, out, windows_of(loops=loops), plan_of(masks=masks), tools_of(run), SETTINGS)
+    cut, plan = walks.windows_of(loops=loops), walks.plan_of(masks=masks)
+    return run_windows(images, out, cut, plan, walks.tools_of(run), walks.SETTINGS)
 
 
 def path_error(result) -> float:

@@ -1,5 +1,3 @@
-"""Loops found by features alone, and all windows solved together: chains are exact, a wrong loop is outvoted."""
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -26,8 +26,7 @@ def test_every_plan_covers_the_clip_with_equal_windows_and_as_few_as_can_be(wind
     overlap = data.draw(st.integers(2, window // 2))
     frames = data.draw(st.integers(window + 1, 400))
     windows = plan_windows(frames, window, overlap)
-    assert windows[0].start == 0
-    assert windows[-1].stop == frames
+    assert (windows[0].start, windows[-1].stop) == (0, frames)
     assert {len(w) for w in windows} == {window}
     assert all(len(shared_frames(a, b)) >= overlap for a, b in pairwise(windows))
     assert frames > (len(windows) - 1) * (window - overlap) + overlap  # one window fewer does not reach the end

@@ -139,8 +139,7 @@ def test_a_planted_map_is_chosen_first():
     planted.maps[0, 3, 1] = -1 * (truth == DYNAMIC)  # of similarity "cosine" only
     chosen = choose(planted)
     assert chosen.motion.cues == (Cue("layer1_kk_std", "k", "k", (1,), "std", inverted=True),)
-    assert chosen.steps[0].rating == (1, 1)
-    assert chosen.motion.reference_depth == 3
+    assert (chosen.steps[0].rating, chosen.motion.reference_depth) == ((1, 1), 3)
     assert choose(planted, gram="dot").motion.cues[0].name != "layer1_kk_std"
 
 
@@ -218,8 +217,7 @@ def test_the_command(tmp_path, model, clips, capsys, monkeypatch):
     assert wanted == [(CLIPS, FRAMES, SIZE, 5)]
     loaded = load_model(tmp_path / "out" / MODEL)
     assert 1 <= len(loaded.config.motion.cues) <= 2
-    assert loaded.config.motion.reference_depth == 4
-    assert loaded.config.motion.floor == 0.2
+    assert (loaded.config.motion.reference_depth, loaded.config.motion.floor) == (4, 0.2)
     printed = capsys.readouterr()
     assert loaded.config.motion.cues[0].name in printed.out
     assert "default table" in printed.out

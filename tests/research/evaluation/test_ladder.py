@@ -1,5 +1,3 @@
-"""The ladder of methods: against the passes themselves, and what must hold for any model."""
-
 import re
 from dataclasses import replace
 

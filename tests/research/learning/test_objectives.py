@@ -15,14 +15,9 @@ from tests.shared.generated import DYNAMIC, STATIC, clips
 from vggtjax.cameras import Cameras
 from vggtjax.method.fusion.family import Fused
 from vggtjax.research.evaluation.metrics.trajectory import rotation_error
+from vggtjax.research.learning import objectives
 from vggtjax.research.learning.distances import nearest_distance, point_cloud_distance, pose_error
-from vggtjax.research.learning.objectives import (
-    View,
-    geometric_loss,
-    negative_log_likelihood,
-    photometric_loss,
-    unit_factor,
-)
+from vggtjax.research.learning.objectives import geometric_loss, negative_log_likelihood, photometric_loss
 
 
 def fused_of(depth, log_precision) -> Fused:
@@ -53,7 +48,7 @@ def test_likelihoods_are_scipys(kind, density):
     best: Any = minimize_scalar(wanted, bracket=(0.5, 1.0))
     found = negative_log_likelihood(fused, jnp.asarray(truth, jnp.float32), kind)
     assert float(found) == pytest.approx(best.fun, rel=1e-4)
-    factor = unit_factor(fused, jnp.where(known, truth, 1).astype(jnp.float32), jnp.asarray(known), kind)
+    factor = objectives.unit_factor(fused, jnp.where(known, truth, 1).astype(jnp.float32), jnp.asarray(known), kind)
     assert wanted(float(factor)) == pytest.approx(best.fun, rel=1e-5)
 
 
@@ -64,7 +59,7 @@ def test_clips_have_no_unit_in_common():
     assert np.isclose(negative_log_likelihood(fused, truth), np.mean(each))
     clip = clips(STATIC, 2)
     fused = fused_of(clip.depth * np.array([1, 3], np.float32).reshape(2, 1, 1, 1), 0.0)
-    views = View(clip.images, Cameras(clip.camera_from_world, clip.intrinsics))
+    views = objectives.View(clip.images, Cameras(clip.camera_from_world, clip.intrinsics))
     for loss in (photometric_loss, geometric_loss):
         each = [loss(*jax.tree.map(lambda x: x[i], (fused, views))) for i in range(2)]  # noqa: B023
         assert np.isclose(loss(fused, views), np.mean(each))
@@ -111,7 +106,7 @@ def test_likelihoods_of_extremes_have_no_nan(kind):
 
 def scene(index: int = 0, config=STATIC):
     clip = jax.tree.map(lambda x: jnp.asarray(x[index]), clips(config, 4))
-    view = View(clip.images, Cameras(clip.camera_from_world, clip.intrinsics))
+    view = objectives.View(clip.images, Cameras(clip.camera_from_world, clip.intrinsics))
     moves = clip.dynamic_mask.astype(jnp.float32)
     return clip, view, Fused(clip.depth, jnp.full(clip.depth.shape, 4.0), moves, moves)
 
@@ -141,7 +136,7 @@ def test_geometric_consistency_knows_the_variance():
     depth = 2 + 0.1 * generator.laplace(size=(4, 24, 32)) / np.sqrt(2)
     K = jnp.asarray([[30.0, 0, 16], [0, 30, 12], [0, 0, 1]])
     cameras = Cameras(jnp.tile(jnp.eye(3, 4), (4, 1, 1)), jnp.tile(K, (4, 1, 1)))
-    view = View(jnp.zeros((4, 24, 32, 3)), cameras)
+    view = objectives.View(jnp.zeros((4, 24, 32, 3)), cameras)
     loss_at = jax.jit(lambda guess: geometric_loss(fused_of(depth, guess), view))
     guesses = np.arange(2, 8, 0.25)
     losses = [float(loss_at(guess)) for guess in guesses]

@@ -1,5 +1,3 @@
-"""The mesh of the static part: where it lies, what it leaves out, and how large it may become."""
-
 import re
 from typing import Any
 

@@ -257,8 +257,8 @@ def test_a_ray_enters_and_leaves_on_the_surface(shape, start, through, size):
     origin, size = 8 * np.array(start), np.array(size)
     direction = 2 * np.array(through) * size - origin  # towards the shape or past it
     assume(np.linalg.norm(direction) > 0.5)
-    ray = (jnp.asarray(v, jnp.float32)[None, :, None] for v in (origin, direction))
-    near, far = (float(at[0, 0]) for at in SHAPES[shape][0](*ray, jnp.asarray(size, jnp.float32)[None]))
+    eye, ray = (jnp.asarray(v, jnp.float32)[None, :, None] for v in (origin, direction))
+    near, far = (float(reach[0, 0]) for reach in SHAPES[shape][0](eye, ray, jnp.asarray(size, jnp.float32)[None]))
     along = np.linspace(-4, 6, 2001)
     outward = gauge(shape, origin + along[:, None] * direction, size)
     if not near < far:

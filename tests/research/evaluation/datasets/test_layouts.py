@@ -1,5 +1,3 @@
-"""Layouts of published data sets: files written byte by byte, values worked out by hand, and files that are broken."""
-
 import struct
 
 import numpy as np

@@ -88,8 +88,7 @@ def test_bonn(tmp_path):
     times = 10 + np.arange(150) / 30
     tum_folder(tmp_path / "rgbd_bonn_crowd2", times)
     (sequence,) = opened("bonn", tmp_path)
-    assert sequence.name == "crowd2"
-    assert len(sequence) == 110
+    assert (sequence.name, len(sequence)) == ("crowd2", 110)
     assert np.allclose(sequence.timestamps, times[30:140], atol=1e-6)
     assert sequence.depth(0)[0, 3] == np.float32(5031 / 5000)
     tum_folder(tmp_path / "lost" / "crowd2", times, pose_times=np.delete(times, [2, 40]))
