@@ -1,18 +1,20 @@
+"""Cameras, and similarities of worlds: composed, inverted, and fitted with weights."""
+
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from vggtjax import cameras as geometry
-from vggtjax.errors import ResultError
+from vggtjax.errors import InputError, ResultError
+from vggtjax.similarity import Similarity, umeyama_sim3
 
 
 def test_unproject_at_corners_equals_the_public_code(golden):
     with np.load(golden / "forward_frames4.npz") as arrays:
-        depth, intrinsics, camera_from_world, expected = (
-            arrays[f"plain/{name}"][0] for name in ("depth", "intrinsic", "extrinsic", "world_points_from_depth")
-        )
+        names = ("depth", "intrinsic", "extrinsic", "world_points_from_depth")
+        depth, intrinsics, camera_from_world, expected = (arrays[f"plain/{name}"][0] for name in names)
     points = geometry.unproject(depth[..., 0], intrinsics, camera_from_world, pixel_offset=0.0)
     assert points.dtype == np.float32
     np.testing.assert_allclose(points, expected, rtol=1e-5, atol=1e-5 * expected.std())
@@ -29,9 +31,8 @@ def test_unprojected_points_project_to_pixel_centres(turn, centre, focal, seed):
     camera_from_world = np.concatenate([rotation, -rotation @ np.array(centre)[:, None]], axis=1)[None]
     intrinsics = np.array([[[focal[0], 0, 4], [0, focal[1], 3], [0, 0, 1]]])
     depth = np.random.default_rng(seed).uniform(0.5, 20, (1, 6, 8))
-    points = geometry.unproject(
-        *(array.astype(np.float32) for array in (depth, intrinsics, camera_from_world)), pixel_offset=0.5
-    )
+    single = (array.astype(np.float32) for array in (depth, intrinsics, camera_from_world))
+    points = geometry.unproject(*single, pixel_offset=0.5)
     seen = points[0] @ rotation.T + camera_from_world[0, :, 3]
     seen = seen @ intrinsics[0].T
     np.testing.assert_allclose(seen[..., 2], depth[0], rtol=1e-4, atol=1e-5)
@@ -61,3 +62,35 @@ def test_frustum_corners_by_hand():
     corners = geometry.frustum_corners(intrinsics, camera_from_world, height=4, width=6, size=3**0.5)
     expected = [[0, 0, 1], [-1, -1, 2], [1, -1, 2], [1, 1, 2], [-1, 1, 2]]
     np.testing.assert_allclose(corners[0], expected, atol=1e-6)
+
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def random_similarity(generator) -> Similarity:
+    rotation = Rotation.random(rng=generator).as_matrix()
+    return Similarity(float(np.exp(generator.normal())), rotation, 5 * generator.normal(size=3))
+
+
+def test_after_by_hand():
+    turned = Similarity(2.0, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([1.0, 0, 0]))
+    moved = Similarity(1.0, np.eye(3), np.array([0.0, 3, 0]))
+    point = np.array([[1.0, 0, 0]])
+    assert np.allclose(moved.after(turned).apply(point), [[1, 5, 0]])  # (1, 0, 0) -> (1, 2, 0) -> (1, 5, 0)
+    assert np.allclose(turned.after(moved).apply(point), [[-5, 2, 0]])  # -> (1, 3, 0) -> (-6 + 1, 2, 0)
+
+
+@settings(max_examples=30)
+@given(seed=seeds)
+def test_a_whole_weight_is_as_many_points(seed):
+    generator = np.random.default_rng(seed)
+    source = generator.normal(size=(6, 3))
+    target = random_similarity(generator).apply(source) + 0.2 * generator.normal(size=(6, 3))
+    times = np.array([1, 2, 3, 1, 1, 4])
+    one = umeyama_sim3(source, target, weights=times.astype(float))
+    other = umeyama_sim3(np.repeat(source, times, axis=0), np.repeat(target, times, axis=0))
+    assert one.scale == pytest.approx(other.scale)
+    assert np.allclose(one.rotation, other.rotation)
+    assert np.allclose(one.translation, other.translation)
+    with pytest.raises(InputError, match="6 weights for 7 points"):
+        umeyama_sim3(np.eye(7, 3), np.eye(7, 3), weights=np.ones(6))

@@ -6,16 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vggtjax.errors import (
-    MOST_LETTERS,
-    ClipError,
-    InputError,
-    MissingExtraError,
-    OutputError,
-    check_regular,
-    problems_sentence,
-    reading,
-)
+from vggtjax import errors
+from vggtjax.errors import MOST_LETTERS, ClipError, InputError, OutputError
 
 
 @given(st.text(max_size=2000))
@@ -32,25 +24,28 @@ def test_the_middle_of_a_long_message_is_left_out():
     assert shown.startswith("xxx")
     assert shown.endswith("x is bad; rename it")
     assert str(InputError("two\nlines \x1b[31m\udcff")) == "two lines ?[31m?"
-    assert str(MissingExtraError("depth", "exr")) == "depth needs the extra 'exr': pip install -e '.[exr]'"
+    assert str(errors.MissingExtraError("depth", "exr")) == "depth needs the extra 'exr': pip install -e '.[exr]'"
 
 
 def test_problems_fill_a_message_and_no_more():
     problems = [f"missing key {number:04d}" for number in range(1000)]
-    sentence = problems_sentence("weights", problems)
+    sentence = errors.problems_sentence("weights", problems)
     shown = sentence.count("missing key")
     assert sentence.startswith("weights: 1000 problems: missing key 0000; ")
     assert sentence.endswith(f"; and {1000 - shown} more")
     assert shown > 15
     assert len(sentence) <= MOST_LETTERS
-    assert problems_sentence("weights", ["y" * 5000, "z"]).endswith("y...; z")
+    assert errors.problems_sentence("weights", ["y" * 5000, "z"]).endswith("y...; z")
 
 
 def test_pipes_and_devices_are_refused_before_they_are_opened(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "zeros").symlink_to("/dev/zero")
     for name in ("pipe", "zeros"):
-        with pytest.raises(ClipError, match="is a pipe, a socket or a device"), reading(tmp_path / name, ClipError):
+        with (
+            pytest.raises(ClipError, match="is a pipe, a socket or a device"),
+            errors.reading(tmp_path / name, ClipError),
+        ):
             pytest.fail("it was opened")
     for fine in (tmp_path, tmp_path / "missing", "some words", "\0"):
-        check_regular(fine)
+        errors.check_regular(fine)

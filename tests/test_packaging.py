@@ -25,16 +25,8 @@ def repository(folder: Path, umask: int) -> Path:
         skipped = shutil.ignore_patterns("__pycache__")
         shutil.copytree(ROOT / name, folder / name, ignore=skipped, copy_function=shutil.copyfile)
     day = {f"GIT_{who}_DATE": "2026-01-01T00:00:00Z" for who in ("AUTHOR", "COMMITTER")}
-    author = (
-        "-c",
-        "user.name=test",
-        "-c",
-        "user.email=test@localhost",
-        "-c",
-        "commit.gpgsign=false",
-        "-c",
-        "core.compression=0",
-    )
+    settings = ("user.name=test", "user.email=test@localhost", "commit.gpgsign=false", "core.compression=0")
+    author = [word for setting in settings for word in ("-c", setting)]
     for command in (["init", "--quiet"], ["add", "--all"], ["commit", "--quiet", "--message", "All"]):
         subprocess.run(["git", *author, *command], cwd=folder, check=True, umask=umask, env=os.environ | day)
     for path in folder.rglob("*"):
@@ -90,13 +82,8 @@ def test_the_wheel_works_outside_the_repository(wheel, tmp_path):
         archive.extractall(tmp_path / "installed")
     tops = {name.split("/")[0] for name in names if not name.split("/")[0].endswith(".dist-info")}
     assert tops == {"vggtjax", "converters"}
-    needed_files = (
-        "__init__.pyi",
-        "py.typed",
-        "pipeline/pretrained/model.safetensors",
-        "pipeline/pretrained/WEIGHTS-LICENSE.md",
-        "results/viewer/client/main.js",
-    )
+    needed_files = ("__init__.pyi", "py.typed", "results/viewer/client/main.js")
+    needed_files += ("pipeline/pretrained/model.safetensors", "pipeline/pretrained/WEIGHTS-LICENSE.md")
     assert {f"vggtjax/{name}" for name in needed_files} <= set(names)
     (entry_points,) = (tmp_path / "installed").glob("*.dist-info/entry_points.txt")
     assert "vggtjax = vggtjax.__main__:run" in entry_points.read_text()
@@ -104,14 +91,10 @@ def test_the_wheel_works_outside_the_repository(wheel, tmp_path):
     needed = [line for line in metadata.read_text().splitlines() if line.startswith("Requires-Dist: av")]
     assert needed  # videos are read without an extra
     assert not any("extra" in line for line in needed)
+    environment = {"PYTHONPATH": str(tmp_path / "installed"), "PATH": ""}
     code = "import vggtjax, converters; print(vggtjax.__file__); vggtjax.forward; converters.convert; vggtjax.METHODS"
     made = subprocess.run(
-        [sys.executable, "-P", "-c", code],
-        cwd=tmp_path,
-        env={"PYTHONPATH": str(tmp_path / "installed"), "PATH": ""},
-        capture_output=True,
-        text=True,
-        check=False,
+        [sys.executable, "-P", "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
     )
     assert made.returncode == 0, made.stderr
     assert str(tmp_path) in made.stdout

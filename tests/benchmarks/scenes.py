@@ -18,7 +18,7 @@ SIDE = 28
 
 def tiny_file(folder: Path) -> Path:
     """Write a model for pictures of 28 x 28 pixels."""
-    config = tiny_config(image_size=SIDE, track_features=8, track_hidden=16)
+    config = tiny_config(image_size=SIDE)
 
     def layer_scale(path, leaf):  # so large that attention shows
         return jnp.full_like(leaf, 0.5) if path[-1].key in ("scale1", "scale2") else leaf

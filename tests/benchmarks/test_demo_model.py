@@ -1,24 +1,19 @@
-"""The benchmark of a model: blind guesses by hand, filmed clips in windows, and a small run of everything."""
+"""The benchmark of a model: blind guesses and summaries by hand, filmed clips in windows, a small run of everything."""
 
 import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from benchmarks import __main__ as benchmarks
 from benchmarks import demo_model
-from benchmarks.blind_guesses import (
-    Prior,
-    compare,
-    guesses,
-    mean_depth_map,
-)
+from benchmarks.blind_guesses import Prior, compare, guesses, mean_depth_map
 from benchmarks.real_clips import load_windows, window_starts
-from benchmarks.summaries import comparison_table
+from benchmarks.summaries import changes_table, comparison_table, ladder_table, saliency_auc, spread, summarise
 from tests.benchmarks.scenes import SIDE, drawn_scenes, row, tiny_file
+from tests.shared.dataset_files import write_plain
 from tests.shared.tiny import tiny_config
 from vggtjax.clips.truth import Truth
 from vggtjax.errors import InputError
@@ -27,24 +22,19 @@ FRAMES = 3
 
 
 def write_clip(folder, frames=FRAMES, jump_at=0) -> None:
-    """A filmed clip as the benchmark expects it: 56 x 56 pixels, depth 1000 + 10 x column millimetres."""
+    """A filmed clip as the benchmark expects it: 56 x 56 pixels, depth 1 + column / 100 metres."""
     generator = np.random.default_rng(0)
     poses = np.tile(np.eye(4), (frames, 1, 1))
     poses[:, :3, :3] = Rotation.from_rotvec(0.1 * np.arange(frames)[:, None] * [0, 1, 0.3]).as_matrix()
     poses[:, :3, 3] = 0.1 * np.arange(frames)[:, None] + 0.03 * generator.normal(size=(frames, 3))
     poses[jump_at:, :3, 3] += 50
-    depth = np.tile(1000 + 10 * np.arange(56, dtype=np.uint16), (56, 1))
-    depth[:8] = 0
-    for name in ("rgb", "depth", "mask"):
-        (folder / name).mkdir(parents=True)
+    depth = np.tile(1 + np.arange(56) / 100, (frames, 56, 1))
+    depth[:, :8] = 0
+    moving = np.zeros((frames, 56, 56), bool)
     for frame in range(frames):
-        moving = np.zeros((56, 56), np.uint8)
-        moving[20:40, 10 + frame : 30 + frame] = 255
-        images = {"rgb": generator.integers(0, 255, (56, 56, 3), np.uint8), "depth": depth, "mask": moving}
-        for name, image in images.items():
-            Image.fromarray(image).save(folder / f"{name}/{frame:05}.png")
-    np.savetxt(folder / "world_from_camera.txt", poses.reshape(frames, 16))
-    np.savetxt(folder / "K.txt", [[50, 0, 28], [0, 50, 28], [0, 0, 1]])
+        moving[frame, 20:40, 10 + frame : 30 + frame] = True
+    images, K = generator.random((frames, 56, 56, 3)), np.array([[50.0, 0, 28], [0, 50, 28], [0, 0, 1]])
+    write_plain(folder, Truth(images, depth, moving, np.linalg.inv(poses)[:, :3], np.tile(K, (frames, 1, 1))))
 
 
 def test_filmed_clips_arrive_at_the_models_pixels(tmp_path):
@@ -119,3 +109,42 @@ def test_a_small_run_of_everything(tmp_path, capsys, monkeypatch):
     assert len(report["dynamic"]["summaries"]) == 1 + 3 * 2
     for name in ("dynamic-zero", "dynamic-sweep-4dvggt-d", "composite-ladder-zero"):
         assert (out / f"{name}.png").is_file()
+
+
+def test_summaries_by_hand():
+    plain = [row(clip=0, abs_rel=0.2, saliency_auc=0.5), row(clip=1, abs_rel=0.4, saliency_auc=0.7)]
+    setting = {"method": "4dvggt-d", "mask_source": "mined", "mask_pairs": 5, "suppress": "zero"}
+    masked = [row(clip=0, abs_rel=0.1, **setting), row(clip=1, failure="odd", **setting)]
+    by_seed = [plain + masked, [*plain[:1], row(clip=0, abs_rel=0.3, **setting)]]
+    first, second = summarise(by_seed)
+    assert (first.method, first.mask_source, first.clips, first.failed) == ("vggt", None, 3, 0)
+    assert first.scores["abs_rel"].mean == pytest.approx((0.3 + 0.2) / 2)
+    assert first.scores["abs_rel"].deviation == pytest.approx(0.1 / np.sqrt(2))
+    assert (second.clips, second.failed) == (3, 1)
+    assert second.scores["abs_rel"].mean == pytest.approx((0.1 + 0.3) / 2)
+    assert second.ratios["abs_rel"].mean == pytest.approx((0.1 / 0.2 + 0.3 / 0.2) / 2)
+    assert "rotation_error" not in second.scores
+    assert saliency_auc(by_seed) == spread([0.6, 0.5])
+    assert [spread([0.25]).text(), spread([1, 3]).text(2)] == ["0.250", "2.00 ± 1.41"]
+    assert "1 failed" in ladder_table([first, second]).splitlines()[3]
+
+
+def test_changes_by_hand():
+    masked = {"mask_source": "true", "mask_pairs": 5, "suppress": "zero"}
+
+    def rows(method, *errors, **setting):
+        return [row(clip=clip, method=method, rotation_error=error, **setting) for clip, error in enumerate(errors)]
+
+    draws = [
+        rows("vggt", 4, 2) + rows("pose-decoupling", 3, 2, **masked) + rows("4dvggt-d", 1, 2, **masked),
+        rows("vggt", 1, 5) + rows("pose-decoupling", 1, 4, **masked) + rows("4dvggt-d", 2, None, **masked),
+    ]
+    plain, decoupled, ours = summarise(draws)
+    assert plain.changes == {}
+    change = decoupled.changes["rotation_error"]
+    assert (change.mean, change.share) == (-0.5, -0.5 / 3)
+    assert change.error == pytest.approx(np.std([-1, 0, 0, -1], ddof=1) / 2)
+    # in draw 2 all methods have the first clip alone: a tie with vggt
+    assert (change.better, change.best, change.draws) == (2, 1, 2)
+    assert ours.changes["rotation_error"].mean == pytest.approx((-3 + 0 + 1) / 3)
+    assert "| -0.500 ± 0.289 (-16.7 %); 2/2, 1/2 " in changes_table([plain, decoupled, ours])

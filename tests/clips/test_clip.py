@@ -38,16 +38,12 @@ def test_a_clip_by_hand():
 
 
 def test_a_clip_for_a_model():
-    """Loaded as `reconstruct` loads it, though the caller knows no size of the model."""
-    model = tiny_model(image_size=56, patch_size=8)
-    clip = load_clip(frames((40, 20)), model=model)
-    read = read_inputs(model, frames((40, 20)), size=None, masks=None, tracks=None, known=None, on_stage=no_stage).clip
-    assert (
-        (clip.size, clip.patch, clip.images.shape)
-        == (read.size, read.patch, read.images.shape)
-        == (56, 8, (1, 32, 56, 3))
-    )
-    padded = load_clip(frames((40, 20)), model=model, size=32, mode="pad", patch=8)
+    model, arrays = tiny_model(image_size=56, patch_size=8), frames((40, 20))
+    clip = load_clip(arrays, model=model)
+    read = read_inputs(model, arrays, size=None, masks=None, tracks=None, known=None, on_stage=no_stage).clip
+    for each in (clip, read):  # as `reconstruct` loads it
+        assert (each.size, each.patch, each.images.shape) == (56, 8, (1, 32, 56, 3))
+    padded = load_clip(arrays, model=model, size=32, mode="pad", patch=8)
     assert padded.images.shape == (1, 32, 32, 3)
     with pytest.raises(InputError, match="patch is 14; leave it out, as the model's patch size is 8"):
         load_clip(frames((40, 20)), model=model, patch=14)

@@ -1,5 +1,3 @@
-"""Lists of clips: names, paths, and a sentence with the line for what is wrong."""
-
 import pyarrow as pa
 import pytest
 from pyarrow import parquet
@@ -48,16 +46,11 @@ def test_lists_that_are_none_are_one_sentence(tmp_path, name, text, sentence):
 
 def test_a_list_may_name_urls_and_one_from_a_url_names_nothing_of_this_machine(tmp_path):
     lines = "source,name\ns3://b/walks/yard.mp4,\nhttps://u:p@h/a%20b.mp4?key=secret,\nfile:///there/my%20cat.mp4,cat\n"
-    assert read_manifest(written(tmp_path, "a.csv", lines)) == {
-        "yard": "s3://b/walks/yard.mp4",
-        "a b": "https://u:p@h/a%20b.mp4?key=secret",
-        "cat": "/there/my cat.mp4",
-    }
+    named = {"yard": "s3://b/walks/yard.mp4", "a b": "https://u:p@h/a%20b.mp4?key=secret", "cat": "/there/my cat.mp4"}
+    assert read_manifest(written(tmp_path, "a.csv", lines)) == named
     url = "s3://bucket/lists/a.csv"
-    assert read_manifest(written(tmp_path, "b.csv", "source\nday/x.mp4\ngs://c/y.mp4\n"), url) == {
-        "x": "s3://bucket/lists/day/x.mp4",
-        "y": "gs://c/y.mp4",
-    }
+    text, below = "source\nday/x.mp4\ngs://c/y.mp4\n", "s3://bucket/lists/day/x.mp4"
+    assert read_manifest(written(tmp_path, "b.csv", text), url) == {"x": below, "y": "gs://c/y.mp4"}
     for source in ("/etc/passwd", "../up.mp4", "a/../../b.mp4", "file:///etc/passwd", "\\\\host\\share"):
         with pytest.raises(ClipError, match="a list from a URL names URLs, and paths below its own"):
             read_manifest(written(tmp_path, "c.csv", f"source\n{source}\n"), url)

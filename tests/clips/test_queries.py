@@ -7,25 +7,14 @@ import pytest
 from PIL import Image
 
 from tests.shared.seeded import seeded_images
-from tests.shared.tiny import tiny_config
-from vggtjax import Reconstruction, init_params, load_clip, reconstruct
+from tests.shared.tiny import tiny_model
+from vggtjax import Reconstruction, load_clip, reconstruct
 from vggtjax.clips.queries import Queries, check_words, parse_queries
 from vggtjax.errors import InputError, ResultError
-from vggtjax.network.checkpoint import Model
 
 pytestmark = pytest.mark.filterwarnings("ignore:the field of view")  # seeded weights give odd cameras
 
 POINTS = Queries(np.array([[10, 12], [40, 30], [5.5, 50], [33, 33]]), np.array([0, 2, 0, 2]))
-
-
-@pytest.fixture(scope="module")
-def config():
-    return tiny_config()
-
-
-@pytest.fixture(scope="module")
-def params(config):
-    return init_params(0, config)
 
 
 @pytest.fixture(scope="module")
@@ -34,16 +23,16 @@ def clip():
 
 
 @pytest.fixture(scope="module")
-def tracked(params, config, clip) -> Reconstruction:
-    return reconstruct(Model(config, params, "tiny"), clip, size=56, method="vggt", tracks=POINTS)
+def tracked(clip) -> Reconstruction:
+    return reconstruct(tiny_model(), clip, size=56, method="vggt", tracks=POINTS)
 
 
-def test_points_of_any_frame(params, config, clip, tracked):
+def test_points_of_any_frame(clip, tracked):
     """Points of frame 2 are tracked as those of the first frame in a clip that begins with frame 2."""
     chosen = POINTS.frames == 2
     turned = dataclasses.replace(clip, images=np.roll(clip.images, -2, axis=0))
     first = Queries(POINTS.points[chosen], np.zeros(2, int))
-    made = reconstruct(Model(config, params, "tiny"), turned, size=56, method="vggt", tracks=first)
+    made = reconstruct(tiny_model(), turned, size=56, method="vggt", tracks=first)
     back = np.roll(np.asarray(made.track_positions), 2, axis=0)
     assert np.abs(tracked.track_positions[:, chosen] - back).max() < 2e-2  # sines of a thousand times the flow
     for frame in (0, 2):

@@ -24,13 +24,8 @@ def place(seed, frames, step=3):
     coarse = Image.fromarray(rng.integers(0, 255, (24, 24, 3), np.uint8))
     tint = rng.uniform(0.3, 1, 3)
     wall = np.asarray(coarse.resize((400, 400), Image.Resampling.BICUBIC)) * tint
-    return [
-        wall[step * i : step * i + SIDE, 2 * step * i : 2 * step * i + SIDE].astype(np.uint8) for i in range(frames)
-    ]
-
-
-def shown(pictures):
-    return [look_at(Image.fromarray(picture)) for picture in pictures]
+    starts = range(0, step * frames, step)
+    return [wall[at : at + SIDE, 2 * at : 2 * at + SIDE].astype(np.uint8) for at in starts]
 
 
 BLACK, GREY = np.zeros((SIDE, SIDE, 3), np.uint8), np.full((SIDE, SIDE, 3), 120, np.uint8)
@@ -78,9 +73,8 @@ LONG = place(1, 9)
     ],
 )
 def test_frames_that_are_no_part_of_the_scene(pictures, blank, flashes, shots):
-    found = find_shots(shown(pictures))
-    assert found.blank == blank
-    assert found.flashes == flashes
+    found = find_shots([look_at(Image.fromarray(picture)) for picture in pictures])
+    assert (found.blank, found.flashes) == (blank, flashes)
     assert [(shot.start, shot.stop) for shot in found.shots] == shots
 
 
@@ -91,11 +85,8 @@ def test_they_are_named_with_what_to_do(caplog):
     assert "--skip 0" in caplog.text
     assert "2 shots: frames 1-6, 7-12" in caplog.text
     assert "--start 7 --max-frames 6" in caplog.text
-
-
-def test_numbers_are_those_of_the_source(caplog):
     load_clip([BLACK, *A, *B], start=1, stride=2, size=98)
-    assert "frames 1-5, 7-11" in caplog.text
+    assert "frames 1-5, 7-11" in caplog.text  # numbers are those of the source
 
 
 def test_numbers_of_pictures_with_times_are_places_in_the_folder(tmp_path, caplog):
@@ -124,9 +115,8 @@ def test_each_finding_of_a_long_clip_is_said_when_it_is_read(caplog):
 @pytest.mark.parametrize("stride", [None, 2])
 def test_each_shot_is_taken_by_its_own_numbers(stride):
     source = open_source([BLACK, *FLASH, *B])
-    taken = [
-        [frame.name for frame in source.frames(sampling)] for sampling in shot_samplings(source, Sampling(0, stride))
-    ]
+    samplings = shot_samplings(source, Sampling(0, stride))
+    taken = [[frame.name for frame in source.frames(sampling)] for sampling in samplings]
     every = [[1, 2, 3, 5, 6], [*range(7, 13)]] if stride is None else [[2, 6], [8, 10, 12]]
     assert taken == [[f"{number:06d}" for number in numbers] for numbers in every]
 

@@ -1,5 +1,3 @@
-"""What can be named as the source of a clip."""
-
 from pathlib import Path
 
 import numpy as np

@@ -1,29 +1,19 @@
 """Frames of one picture: codecs change them and nothing moves; small and faint things that move are seen."""
 
+from typing import Any
+
 import av
 import numpy as np
 import PIL.Image
 import pytest
 
+from tests.shared.videos import encode
 from vggtjax import load_clip
 from vggtjax.clips.still import same_picture
 from vggtjax.pipeline.pretrained.embedded import demo_clip
 
 OLD_ROUNDING = 2 / 255
 GREY = np.full((84, 98, 3), 100 / 255, np.float32)
-
-
-def write_repeated(path, picture, frames, codec):
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream(codec, rate=25, options={"crf": "23"} if codec == "libx264" else {})
-        stream.height, stream.width = picture.shape[:2]
-        stream.pix_fmt, stream.bit_rate = "yuv420p", 0 if codec == "libx264" else 2_000_000
-        for number in range(frames):
-            frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
-            frame.pts = number
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
-    return path
 
 
 def photo():
@@ -41,11 +31,12 @@ def changed(rows, columns, amount, channels=slice(None)):
 def test_a_photo_as_a_video_is_still(tmp_path, codec):
     if codec not in av.codecs_available:
         pytest.skip(f"FFmpeg here has no {codec}")
-    clip = load_clip(write_repeated(tmp_path / "photo.mp4", photo(), 8, codec), size=280, patch=14)
+    how: Any = {"crf": "23"} if codec == "libx264" else {"bits": 2_000_000}
+    clip = load_clip(encode(tmp_path / "photo.mp4", [photo()] * 8, codec, **how), size=280, patch=14)
     assert np.abs(clip.images - clip.images[0]).max() > OLD_ROUNDING
     assert clip.is_still
     for level in (0, 255):
-        plain = write_repeated(tmp_path / f"{level}.mp4", np.full((84, 98, 3), level, np.uint8), 8, codec)
+        plain = encode(tmp_path / f"{level}.mp4", [np.full((84, 98, 3), level, np.uint8)] * 8, codec, **how)
         assert load_clip(plain, size=98, patch=14).is_still
     moving = demo_clip().images
     assert not any(same_picture(a, b) for a, b in zip(moving[1:], moving[:-1], strict=True))

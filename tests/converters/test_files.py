@@ -14,7 +14,6 @@ from safetensors.numpy import save_file
 from converters import convert, convert_state_dict
 from converters.files import choose_file, read_state_dict, weight_files
 from tests.shared.make_checkpoint import make_checkpoint
-from tests.shared.seeded import seeded_state_dict
 from vggtjax import load_model
 from vggtjax.errors import CheckpointError
 
@@ -23,29 +22,14 @@ SHARDS = [f"model-0000{number}-of-00003.safetensors" for number in (1, 2, 3)]
 KEY = "camera_head.pose_branch.fc1.bias"
 
 
-@pytest.fixture(scope="module")
-def torch():
-    return pytest.importorskip("torch")  # where it is used: it takes seconds to import
+@pytest.fixture(scope="session")
+def expected(seeded, config):
+    return convert_state_dict(seeded, config)
 
 
 @pytest.fixture(scope="module")
-def shapes(golden):
-    return json.loads((golden / "shapes.json").read_text())
-
-
-@pytest.fixture(scope="module")
-def state_dict(shapes):
-    return seeded_state_dict(shapes)
-
-
-@pytest.fixture(scope="module")
-def expected(state_dict, config):
-    return convert_state_dict(state_dict, config)
-
-
-@pytest.fixture(scope="module")
-def tensors(torch, state_dict):
-    return {name: torch.from_numpy(value) for name, value in state_dict.items()}
+def tensors(torch, seeded):
+    return {name: torch.from_numpy(value) for name, value in seeded.items()}
 
 
 @pytest.fixture
@@ -64,10 +48,7 @@ def few(tmp_path):
 def refusal(path, function=read_state_dict) -> str:
     with pytest.raises(CheckpointError) as raised:
         function(path)
-    message = str(raised.value)
-    assert "\n" not in message
-    assert len(message) < 6000
-    return message
+    return str(raised.value)
 
 
 def assert_converts(source, config, expected, tmp_path):

@@ -1,5 +1,3 @@
-"""Weights by hub id, from a server on this machine that answers as the hub does."""
-
 import hashlib
 import json
 import re
@@ -108,11 +106,6 @@ def hub(tmp_path, monkeypatch):
     thread.join()
 
 
-@pytest.fixture(scope="module")
-def shapes(golden):
-    return json.loads((golden / "shapes.json").read_text())
-
-
 @pytest.fixture
 def repository(hub, tmp_path):
     folder = tmp_path / "repository"
@@ -125,7 +118,6 @@ def repository(hub, tmp_path):
 def refusal(source) -> str:
     with pytest.raises(CheckpointError) as raised:
         locate(source)
-    assert "\n" not in str(raised.value)
     return str(raised.value)
 
 

@@ -20,7 +20,6 @@ from safetensors.numpy import save_file
 from converters import convert, convert_state_dict
 from converters.rules import CONV, DENSE, DEPTH_TO_SPACE, IGNORED, POINTWISE, RULES, SAME, TRACKS, UNBATCHED
 from converters.torch_to_flax import source_shapes
-from tests.shared.seeded import seeded_state_dict
 from vggtjax import forward, load_model
 from vggtjax.config import vggt_1b
 from vggtjax.errors import CheckpointError, InputError, OutputError
@@ -29,16 +28,6 @@ from vggtjax.network.model import HEADS
 
 VIRTUAL_TRACKS = "track_head.tracker.updateformer.virual_tracks"
 BIAS = "camera_head.pose_branch.fc1.bias"
-
-
-@pytest.fixture(scope="module")
-def shapes(golden):
-    return json.loads((golden / "shapes.json").read_text())
-
-
-@pytest.fixture
-def state_dict(shapes):
-    return seeded_state_dict(shapes)
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Checkpoints as trainers write them: other entries, shared prefixes, adapters, heads that were not trained."""
+"""Checkpoints as trainers write them, and those of VGGT's relatives, which are refused by name."""
 
 import argparse
 import json
@@ -6,28 +6,18 @@ import logging
 import types
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from converters import convert_state_dict
+from converters import convert, convert_state_dict
 from converters.files import read_state_dict
-from tests.shared.seeded import seeded_state_dict
-from vggtjax import forward, load_model
-from vggtjax.errors import CheckpointError, InputError
+from converters.foreign import FOREIGN, refuse_foreign
+from converters.locate import locate
+from vggtjax import load_model
+from vggtjax.errors import CheckpointError
 
 TINY = {"aggregator.camera_token": np.ones((1, 2), np.float32), "depth_head.norm.bias": np.zeros(3, np.float32)}
-
-
-@pytest.fixture(scope="module")
-def torch():
-    return pytest.importorskip("torch")
-
-
-@pytest.fixture(scope="module")
-def state_dict(golden):
-    return seeded_state_dict(json.loads((golden / "shapes.json").read_text()))
 
 
 @pytest.mark.parametrize("prefix", ["module.", "model.", "_orig_mod.", "module._orig_mod.", "vggt.net."])
@@ -43,10 +33,7 @@ def test_a_shared_prefix_is_left_out_and_said(state_dict, config, caplog, prefix
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (
-            lambda name: {f"base_model.model.{name}": 0, f"base_model.model.{name[:-7]}.lora_A.default.weight": 0},
-            "adapter",
-        ),
+        (lambda name: {f"base_model.{name}": 0, f"base_model.{name[:-7]}.lora_A.default.weight": 0}, "adapter"),
         (lambda name: {name: 0, name.replace(".weight", ".lora_down.weight"): 0}, "merge the adapter first"),
         (lambda name: {f"model.{name}": 0, f"ema_model.{name}": 0}, "twice or more, under 'ema_model.' and 'model.'"),
         (lambda name: {name: 0, f"ema.{name}": 0}, "twice or more, under no prefix and 'ema.'"),
@@ -63,19 +50,13 @@ def test_keys_that_need_work_first(config, change, message):
 @pytest.mark.parametrize(
     ("wrap", "said"),
     [
-        (lambda weights, tensor: weights, None),
-        (
-            lambda weights, tensor: {"model": weights, "optimizer": {"state": {0: {"exp_avg": tensor}}}, "epoch": 3},
-            None,
-        ),
-        (lambda weights, tensor: {"state_dict": weights, "scale": tensor}, None),
-        (
-            lambda weights, tensor: {"model": weights, "ema": {"module": weights}},
-            "weights are read from 'model'; those in ema",
-        ),
-        (lambda weights, tensor: {"ema": weights, "steps": 7}, "weights are read from 'ema'"),
-        (lambda weights, tensor: {"module": weights, "lr_scheduler": {"last": 1}}, "weights are read from 'module'"),
-        (lambda weights, tensor: {"ema": {"state_dict": weights}}, "weights are read from 'ema'"),
+        (lambda own, tensor: own, None),
+        (lambda own, tensor: {"model": own, "optimizer": {"state": {0: {"exp_avg": tensor}}}, "epoch": 3}, None),
+        (lambda own, tensor: {"state_dict": own, "scale": tensor}, None),
+        (lambda own, tensor: {"model": own, "ema": {"module": own}}, "are read from 'model'; those in ema"),
+        (lambda own, tensor: {"ema": own, "steps": 7}, "weights are read from 'ema'"),
+        (lambda own, tensor: {"module": own, "lr_scheduler": {"last": 1}}, "weights are read from 'module'"),
+        (lambda own, tensor: {"ema": {"state_dict": own}}, "weights are read from 'ema'"),
     ],
 )
 def test_the_entry_that_is_read(torch, tmp_path, caplog, wrap, said):
@@ -112,5 +93,46 @@ def test_weights_of_some_heads_make_a_model_of_these(state_dict, config, tmp_pat
     assert model.heads == ("camera", "depth")
     assert "trained has the heads camera, depth, and not points, tracks" in caplog.messages
     assert load_model(tmp_path / "trained.safetensors", config=config).heads == ("camera", "depth")  # from the cache
-    with pytest.raises(InputError, match=r"outputs has \['tracks'\]; this model has only the heads"):
-        forward(model.params, jnp.zeros((1, 1, 28, 28, 3)), model.config, outputs=("tracks",))
+
+
+# Keys as the networks' public code builds them.
+KEYS = {
+    "PAGE-4D": "aggregator.spatial_mask_head.head0.0.weight",
+    "VGGT-Omega": "aggregator.inter_frame_blocks.0.norm1.weight",
+    "OmniVGGT": "aggregator.camera_adapters.0.weight",
+    "Pi3": "point_decoder.blocks.0.norm1.weight",
+    "MapAnything": "info_sharing.blocks.0.norm1.weight",
+    "Depth Anything 3": "model.backbone.pretrained.cls_token",
+    "AnySplat": "encoder.aggregator.camera_token",
+    "HunyuanWorld-Mirror": "visual_geometry_transformer.camera_token",
+}
+
+
+@pytest.mark.parametrize("name", KEYS)
+def test_known_by_a_key(state_dict, config, name):
+    with pytest.raises(CheckpointError, match=f"is a checkpoint of {name}, not of VGGT: .* expected weights of VGGT$"):
+        convert_state_dict(state_dict | {KEYS[name]: np.ones(3, np.float32)}, config)
+
+
+def test_streamvggt_is_known_by_its_name_or_its_content(state_dict, config, tmp_path, monkeypatch):
+    with pytest.raises(CheckpointError, match=r"lch01/StreamVGGT is a checkpoint of StreamVGGT, .*causal"):
+        locate("lch01/StreamVGGT")  # before anything is downloaded
+    path = tmp_path / "stream_vggt.safetensors"
+    save_file(state_dict, path)
+    with pytest.raises(CheckpointError, match="rename them if they are weights of VGGT"):
+        convert(path, tmp_path / "x.safetensors", config=config)
+    path = path.rename(tmp_path / "checkpoints.safetensors")
+    digest = convert(path, tmp_path / "x.safetensors", config=config).sha256["checkpoints.safetensors"]
+    (tmp_path / "x.safetensors").unlink()
+    known = [stranger._replace(sha256=(digest,)) if stranger.sha256 else stranger for stranger in FOREIGN]
+    monkeypatch.setattr("converters.foreign.FOREIGN", known)
+    with pytest.raises(CheckpointError, match="checkpoints is a checkpoint of StreamVGGT"):
+        convert(path, tmp_path / "x.safetensors", config=config)
+    assert not (tmp_path / "x.safetensors").exists()
+
+
+def test_vggt_itself_is_no_stranger(golden):
+    keys = json.loads((golden / "shapes_vggt_1b.json").read_text())
+    for name in ("facebook/VGGT-1B", "facebook/VGGT-1B-Commercial", "model_tracker_fixed_e20", "vggt_1B_commercial"):
+        refuse_foreign(name, keys)
+    refuse_foreign("ddp", [f"module.{key}" for key in keys])  # unknown keys, but nobody's in particular

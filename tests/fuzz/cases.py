@@ -130,19 +130,9 @@ def change(folder: Path, random: Random) -> None:
             random.choice(_TREE)(path, random)
 
 
-def _replaced_by_folder(path: Path, _: Random) -> None:
-    path.unlink()
-    path.mkdir()
-
-
 def _linked(path: Path, random: Random) -> None:
     path.unlink()
     path.symlink_to(random.choice(("/dev/zero", "/etc/passwd", "/", ".", path.name, "missing", "/proc/self/mem")))
-
-
-def _piped(path: Path, _: Random) -> None:
-    path.unlink()
-    os.mkfifo(path)
 
 
 def _renamed(path: Path, random: Random) -> None:
@@ -161,7 +151,9 @@ def _copied(path: Path, random: Random) -> None:
 _TREE: tuple[Callable[[Path, Random], object], ...] = (
     lambda path, _: path.unlink(),
     lambda path, _: path.write_bytes(b""),
-    *(_replaced_by_folder, _linked, _piped, _renamed, _copied),
+    lambda path, _: (path.unlink(), path.mkdir()),
+    lambda path, _: (path.unlink(), os.mkfifo(path)),
+    *(_linked, _renamed, _copied),
 )
 
 

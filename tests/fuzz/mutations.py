@@ -11,15 +11,13 @@ from collections.abc import Callable
 from functools import partial
 from random import Random
 
-from tests.fuzz.changes.arrays import change_npy
-from tests.fuzz.changes.headers import change_exr, change_pixmap
 from tests.fuzz.changes.parquet import change_parquet
-from tests.fuzz.changes.pictures import change_jpeg, change_png
+from tests.fuzz.changes.pictures import change_exr, change_jpeg, change_pixmap, change_png
 from tests.fuzz.changes.plain import change_bytes, change_word
 from tests.fuzz.changes.records import BOXES, RIFF, change_records
 from tests.fuzz.changes.text import change_json, change_text
 from tests.fuzz.changes.weights import change_pickle, change_safetensors
-from tests.fuzz.changes.zips import change_zip
+from tests.fuzz.changes.zips import change_npy, change_zip
 
 
 def mutated(content: bytes, random: Random) -> bytes:

@@ -12,12 +12,9 @@ from itertools import product
 DEVICES = 8
 PROCESSES = 2
 out, rank = sys.argv[1], None if len(sys.argv) < 3 else int(sys.argv[2])
-os.environ["XLA_FLAGS"] = " ".join(
-    [
-        f"--xla_force_host_platform_device_count={DEVICES if rank is None else DEVICES // 2 // PROCESSES}",
-        "--xla_backend_optimization_level=0",  # compiling takes nearly all of the time
-    ]
-)
+_count = DEVICES if rank is None else DEVICES // 2 // PROCESSES
+_hasty = "--xla_backend_optimization_level=0"  # compiling takes nearly all of the time
+os.environ["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={_count} {_hasty}"
 
 os.environ["PJRT_NPROC"] = str(2 * DEVICES)  # of threads: devices that wait for each other hold one each
 
@@ -45,9 +42,8 @@ arrays: dict[str, np.ndarray] = {}
 
 def make_model() -> Model:
     """Return a seeded network whose depth and confidence differ from pixel to pixel, not by rounding alone."""
-    track = {"track_corr_levels": 2, "track_corr_radius": 1, "track_features": 8, "track_hidden": 16}
     motion = MotionConfig(cues=MotionConfig().cues[:2])  # a mean and a deviation
-    config = tiny_config(image_size=SIDE, motion=motion, **track)
+    config = tiny_config(image_size=SIDE, motion=motion)
     params = init_params(0, config)
     params["depth_head"]["regression"]["conv2"]["kernel"] *= 50
     return Model(config, params, "tiny")
@@ -86,9 +82,8 @@ def keep_gradient(model: Model, frames: int, devices: int) -> None:
         weights = [np.random.default_rng(0).normal(size=leaf.shape).astype(np.float32) for leaf in leaves]
         return sum(jnp.mean(w * leaf) for w, leaf in zip(weights, leaves, strict=True)), (assembly, passes)
 
-    (_, outputs), gradients = jax.value_and_grad(weighted, argnums=(0, 1), has_aux=True)(
-        model.params, jnp.asarray(images(frames))[None]
-    )
+    differentiated = jax.value_and_grad(weighted, argnums=(0, 1), has_aux=True)
+    (_, outputs), gradients = differentiated(model.params, jnp.asarray(images(frames))[None])
     keep(f"infer {frames}", devices, outputs)
     keep(f"gradient {frames}", devices, gradients)
 

@@ -1,5 +1,3 @@
-"""One clip on several devices: the numbers of one device, the collectives, the memory of each device, two processes."""
-
 import os
 import re
 import socket

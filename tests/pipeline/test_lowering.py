@@ -27,7 +27,7 @@ from vggtjax.training.scenes.textures import load_textures
 
 PLATFORMS = ("cuda", "tpu")
 SIZE, FRAMES = (56, 56), 4
-CONFIG = tiny_config(track_features=8, track_hidden=16, track_corr_levels=3, track_corr_radius=1)
+CONFIG = tiny_config(track_corr_levels=3)
 CUDNN = ("__cudnn$fmhaSoftmax", "__cudnn$fmhaSoftmaxBackward")
 CALLS = [export.DisabledSafetyCheck.custom_call(name) for name in CUDNN]
 
@@ -136,11 +136,8 @@ def test_the_gradient_of_a_dense_head():
     def loss(params, taps):
         return predict_dense(params, taps, CONFIG, (h, w), "depth")[0].sum()
 
-    lowered(
-        jax.grad(loss),
-        parameter_shapes(CONFIG)["depth_head"],
-        [array(1, FRAMES, h * w, width) for width in CONFIG.dpt_channels],
-    )
+    taps = [array(1, FRAMES, h * w, width) for width in CONFIG.dpt_channels]
+    lowered(jax.grad(loss), parameter_shapes(CONFIG)["depth_head"], taps)
 
 
 @pytest.mark.proof

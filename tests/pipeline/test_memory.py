@@ -50,11 +50,6 @@ def test_every_device_holds_all_frames_after_a_pass():
     assert needs > 51 * 64 * 256 * 256
 
 
-@pytest.fixture
-def two_cores(monkeypatch):
-    monkeypatch.setattr("vggtjax.network.kernels.cpu_attention.times_for_cores", lambda: 1)
-
-
 def test_the_logits_that_more_cores_hold_at_once_are_counted(monkeypatch):
     queries, keys = 4 * (5 + 21 * 37), 32 * (5 + 21 * 37)  # of one of eight devices
     needs, rows = [], []
@@ -84,9 +79,10 @@ def test_the_logits_that_more_cores_hold_at_once_are_counted(monkeypatch):
     ],
 )
 def test_the_peaks_of_processes_are_predicted_within_the_error_that_is_promised(
-    monkeypatch, two_cores, frames, height, width, method, devices, measured
+    monkeypatch, frames, height, width, method, devices, measured
 ):
     monkeypatch.setattr("jax.local_device_count", lambda: devices)
+    monkeypatch.setattr("vggtjax.network.kernels.cpu_attention.times_for_cores", lambda: 1)
     predicted = memory.predicted_bytes(demo_model(), frames, height, width, method=method, devices=devices)
     assert predicted == pytest.approx(1e6 * measured, rel=memory.ERROR)
 
@@ -156,10 +152,8 @@ def test_free_memory_is_the_least_of_the_host_and_the_control_groups(tmp_path):
     data = f"Max data size             {2**40}        unlimited            bytes\n"
     space = f"Max address space         {(700000 + 400150) * 1024}            unlimited            bytes\n"
     write("proc/self/limits", title + data + space)
-    assert own_limits(tmp_path) == [
-        ("ulimit -d", 2**40, 300 * 1024),
-        ("ulimit -v", (700000 + 400150) * 1024, 700000 * 1024),
-    ]
+    address = (700000 + 400150) * 1024
+    assert own_limits(tmp_path) == [("ulimit -d", 2**40, 300 * 1024), ("ulimit -v", address, 700000 * 1024)]
     stacks = 300_000_000 / 1024  # of threads that start later
     assert room() == (100 + 200, "of its container (cgroup)", True)
     write("sys/fs/cgroup/c/memory.max", "max")

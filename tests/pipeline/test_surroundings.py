@@ -1,5 +1,3 @@
-"""Settings that a program makes for its own code change no result and break no run."""
-
 from functools import partial
 
 import jax
@@ -65,13 +63,8 @@ def test_types_may_be_promoted_strictly_in_heads_weights_and_models(tiny_demo):
     run = partial(forward, config=config, outputs=config.heads)
     points = jax.ShapeDtypeStruct((1, 3, 2), jnp.float32) if "tracks" in config.heads else None
     for stored in (jnp.float32, jnp.bfloat16):
-        params = jax.tree.map(
-            lambda leaf, stored=stored: jax.ShapeDtypeStruct(leaf.shape, stored), parameter_shapes(config)
-        )
+        as_stored = partial(jax.ShapeDtypeStruct, dtype=stored)
+        params = jax.tree.map(lambda leaf, of=as_stored: of(leaf.shape), parameter_shapes(config))
         assert jax.eval_shape(lambda p, x, q: run(p, x, query_points=q), params, _IMAGES, points).depth is not None
     init_params(0, config)
     load_model("demo")
-
-
-def _stored(leaf, dtype):
-    return jax.ShapeDtypeStruct(leaf.shape, dtype)

@@ -52,10 +52,6 @@ def _csv(path: Path) -> bytes:
     return json.dumps([[row[number] for number in columns] for row in (heading, *rows)]).encode()
 
 
-def _page(path: Path) -> bytes:
-    return _TIMES_OF_PAGES.sub(b"", _ending(path, b"</html>"))
-
-
 def _picture(path: Path) -> bytes:
     """Return a picture; of the plot of a training run, whose axis is the time, the size alone."""
     data = _ending(path, b"IEND\xaeB`\x82")
@@ -86,7 +82,7 @@ def _arrays(path: Path) -> bytes:
 _WITHOUT_TIMES: dict[str, Callable[[Path], bytes]] = {
     ".json": _json,
     ".csv": _csv,
-    ".html": _page,
+    ".html": lambda path: _TIMES_OF_PAGES.sub(b"", _ending(path, b"</html>")),
     ".png": _picture,
     ".safetensors": _weights,
     ".npz": _arrays,

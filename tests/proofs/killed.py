@@ -28,9 +28,8 @@ _PATHS = {
 }
 # Processes fork from one that has imported all and started nothing: no run imports it again.
 _FORKS = multiprocessing.get_context("forkserver")
-_FORKS.set_forkserver_preload(
-    ["vggtjax.pipeline.batch.many", "vggtjax.interface.commands.main", "tests.proofs.test_kills"]
-)
+_MODULES = ["vggtjax.pipeline.batch.many", "vggtjax.interface.commands.main", "tests.proofs.test_kills"]
+_FORKS.set_forkserver_preload(_MODULES)
 
 
 class Ended(NamedTuple):

@@ -1,5 +1,6 @@
 """The truth of a small room, written as other programs write their results."""
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -47,12 +48,8 @@ def write_da3(folder, kind="npz", rows=3):
     """Depth Anything 3's exporters npz and mini_npz: camera-from-world, with a last row or without."""
     poses = np.tile(np.eye(4, dtype=np.float32), (3, 1, 1))
     poses[:, :3] = ROOM.camera_from_world
-    arrays = {
-        "depth": ROOM.depth,
-        "conf": ROOM.depth_confidence,
-        "extrinsics": poses[:, :rows],
-        "intrinsics": ROOM.intrinsics,
-    }
+    arrays = {"depth": ROOM.depth, "conf": ROOM.depth_confidence, "intrinsics": ROOM.intrinsics}
+    arrays["extrinsics"] = poses[:, :rows]
     (folder / "exports" / kind).mkdir(parents=True)
     if kind == "npz":
         arrays["image"] = ROOM.images
@@ -92,13 +89,9 @@ def rearrange(folder):
         (folder / "before" / name).rename(folder / name)
 
 
-def write_as_monst3r(folder):
-    write_flat(folder, padded=False, logarithmic=True)
-
-
 WRITERS = {
-    "vggt4d": lambda folder: write_flat(folder, padded=True, logarithmic=False),
-    **dict.fromkeys(("monst3r", "easi3r", "das3r", "pomato"), write_as_monst3r),
+    "vggt4d": partial(write_flat, padded=True, logarithmic=False),
+    **dict.fromkeys(("monst3r", "easi3r", "das3r", "pomato"), partial(write_flat, padded=False, logarithmic=True)),
     "cut3r": write_cut3r,
     "da3": write_da3,
     "spatialtrackerv2": write_spatialtracker,

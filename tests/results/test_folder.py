@@ -1,5 +1,3 @@
-"""Results that replace earlier ones, in processes that are killed at any moment."""
-
 import errno
 import shutil
 from contextlib import contextmanager
@@ -7,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.results.test_export import files
+from tests.shared.contents import contents
 from tests.shared.room import make_room
 from vggtjax.errors import OutputError
 from vggtjax.results import folder as folders
@@ -99,7 +97,7 @@ def test_a_killed_replacement_is_finished_by_the_next(tmp_path, old, new):
 @pytest.mark.parametrize("failing", [13, 28])
 def test_a_failed_replacement_is_undone(tmp_path, monkeypatch, failing):
     make_room(2).save(tmp_path)
-    before = files(tmp_path)
+    before = contents(tmp_path)
     rename, calls = Path.rename, []
 
     def fail_once(source, target):
@@ -112,7 +110,7 @@ def test_a_failed_replacement_is_undone(tmp_path, monkeypatch, failing):
     if failing < 26:
         with pytest.raises(OutputError, match="Permission denied"):
             make_room(3).save(tmp_path)
-        assert files(tmp_path) == before
+        assert contents(tmp_path) == before
     else:
         make_room(3).save(tmp_path)
         assert len(Reconstruction.load(tmp_path).depth) == 3

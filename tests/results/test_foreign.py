@@ -1,19 +1,10 @@
-"""Result folders of other projects, written here as their public code writes them."""
-
 import logging
 
 import numpy as np
 import pytest
 
-from tests.results.foreign_writers import (
-    QUATERNIONS,
-    ROOM,
-    WITH_MASKS,
-    WRITERS,
-    rearrange,
-    write_da3,
-    write_spatialtracker,
-)
+from tests.results import foreign_writers as writers
+from tests.results.foreign_writers import QUATERNIONS, ROOM, WITH_MASKS, WRITERS
 from vggtjax.errors import InputError, ResultError
 from vggtjax.results.reconstruction import Reconstruction
 
@@ -37,7 +28,7 @@ def test_everything_comes_back(tmp_path, layout):
 
 
 def test_what_das3r_trains_on(tmp_path):
-    rearrange(tmp_path / "x")
+    writers.rearrange(tmp_path / "x")
     result = Reconstruction.load(tmp_path / "x", format="das3r", quaternion="wxyz")
     np.testing.assert_array_equal(result.depth, ROOM.depth)
     np.testing.assert_allclose(result.depth_confidence, ROOM.depth_confidence, rtol=1e-6)
@@ -46,18 +37,16 @@ def test_what_das3r_trains_on(tmp_path):
 
 
 def test_the_file_of_spatialtracker_is_found_and_two_are_refused(tmp_path):
-    write_spatialtracker(tmp_path / "results", "walk_result.npz")
+    writers.write_spatialtracker(tmp_path / "results", "walk_result.npz")
     for path in (tmp_path, tmp_path / "results", tmp_path / "results/walk_result.npz"):
         np.testing.assert_array_equal(Reconstruction.load(path, format="spatialtrackerv2").depth, ROOM.depth)
-    write_spatialtracker(tmp_path / "results", "run_result.npz")
-    with pytest.raises(
-        ResultError, match=r"run_result\.npz and walk_result\.npz may both be the result; give one file"
-    ):
+    writers.write_spatialtracker(tmp_path / "results", "run_result.npz")
+    with pytest.raises(ResultError, match=r"run_result\.npz and walk_result\.npz may both be the result"):
         Reconstruction.load(tmp_path / "results", format="spatialtrackerv2")
 
 
 def test_small_files_of_da3(tmp_path, caplog):
-    write_da3(tmp_path, "mini_npz", rows=4)
+    writers.write_da3(tmp_path, "mini_npz", rows=4)
     with caplog.at_level(logging.WARNING):
         result = Reconstruction.load(tmp_path, format="da3")
     np.testing.assert_allclose(result.camera_from_world, ROOM.camera_from_world)
@@ -75,8 +64,8 @@ def test_the_order_of_quaternions_must_be_said_and_matters(tmp_path):
     assert np.abs(wrong.camera_from_world - ROOM.camera_from_world).max() > 0.1
 
 
-def remove(name):
-    return lambda folder: (folder / name).unlink()
+def without(names):
+    return lambda folder: [path.unlink() for path in folder.glob(names)]
 
 
 def rename(name, other):
@@ -111,26 +100,18 @@ SHAPES = r"'extrinsics' of results.npz is float64 \(1, 3, 4\); expected floating
         ("vggt4d", write("frame_0002.npy", b"\x93NUMPY\x01\x00"), r"frame_0002\.npy has an invalid header"),
         ("vggt4d", save("frame_0002.npy", np.array([{}, 1], object)), "holds Python objects"),
         ("vggt4d", save("frame_0002.npy", np.ones((28, 41), np.float32)), r"has shape \(28, 41\); expected \(28, 42\)"),
-        (
-            "vggt4d",
-            save("conf_0002.npy", np.ones((28, 42), int)),
-            r"conf_0002\.npy is int64 .*; expected float",
-        ),
+        ("vggt4d", save("conf_0002.npy", np.ones((28, 42), int)), r"conf_0002\.npy is int64 .*; expected float"),
         ("vggt4d", save("frame_2.npy", np.ones((28, 42), np.float32)), "are both of frame 2"),
         ("monst3r", rename("conf_0.npy", "conf_0000.npy"), r"conf_0000\.npy is numbered as VGGT4D does"),
         ("cut3r", changed(CAMERA, pose=2 * np.eye(4)), "camera_from_world of frame 1 is not a finite rotation"),
-        ("cut3r", remove(CAMERA), r"frame 1 has depth, but no camera/000001\.npz"),
+        ("cut3r", without(CAMERA), r"frame 1 has depth, but no camera/000001\.npz"),
         ("da3", changed(DA3, image=np.ones((3, 28, 42, 3), np.uint16)), "'image' of .* is uint16 .* expected uint8"),
         ("da3", changed(DA3, extrinsics=np.ones((1, 3, 4))), SHAPES),
-        ("easi3r", remove("conf_1.npy"), r"frame 1 has depth, but no file like conf_0\.npy"),
-        (
-            "das3r",
-            lambda folder: [path.unlink() for path in folder.glob("frame_*.npy")],
-            "frame_0000.npy or depth_maps",
-        ),
+        ("easi3r", without("conf_1.npy"), r"frame 1 has depth, but no file like conf_0\.npy"),
+        ("das3r", without("frame_*.npy"), "frame_0000.npy or depth_maps"),
         ("spatialtrackerv2", changed(TRACKED, depths=None), "'depths' of clip_result.npz is missing"),
         ("spatialtrackerv2", changed(TRACKED, video=ROOM.images), r"'video' of .* is uint8 .* expected floating point"),
-        ("spatialtrackerv2", remove(TRACKED), "it has no result.npz; inference.py writes it"),
+        ("spatialtrackerv2", without(TRACKED), "it has no result.npz; inference.py writes it"),
     ],
 )
 def test_what_is_broken_is_named(tmp_path, layout, change, message):
@@ -139,7 +120,6 @@ def test_what_is_broken_is_named(tmp_path, layout, change, message):
     with pytest.raises(ResultError, match=message) as raised:
         Reconstruction.load(tmp_path / "x", format=layout, quaternion=QUATERNIONS[layout])
     assert str(raised.value).startswith(f"{tmp_path / 'x'} cannot be loaded as a result of {layout}: ")
-    assert "\n" not in str(raised.value)
 
 
 def test_numbers_of_files_and_of_poses_tell_which_frames_have_both(tmp_path, caplog):

@@ -2,16 +2,22 @@ import copy
 import dataclasses
 import io
 import pickle
+import subprocess
+import sys
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.shared.contents import contents
 from tests.shared.room import make_room
 from vggtjax.errors import InputError, ResultError
+from vggtjax.results import result as results
 from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.result import FieldOfViewWarning
 from vggtjax.storage import arrays as archive
+from vggtjax.storage.arrays import is_mapped, spread_frames, zeros_beside
 
 
 def assert_equal(first: Reconstruction, second: Reconstruction) -> None:
@@ -75,19 +81,13 @@ def test_fields_of_view_are_clamped_with_a_warning():
     assert_equal(room, dataclasses.replace(room))
 
 
-def nan_at(name, index):
-    array = getattr(make_room(), name).copy()
-    array[index] = np.nan
-    return {name: array}
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"depth": np.ones((28, 42))}, r"depth has shape \(28, 42\); expected \(frames, rows, columns\)"),
         ({"valid_box": np.array([[0, 0, 42, 28]] * 2 + [[0, 0, 43, 28]])}, r"valid_box of frame 2 is \[0, 0, 43, 28\]"),
         ({"camera_from_world": np.tile(np.diag([1, 1, -1, 1.0])[:3], (3, 1, 1))}, "camera_from_world of frame 0"),
-        (nan_at("intrinsics", (1, 0, 0)), "field of view of frame 1"),
+        ({"intrinsics": make_room().intrinsics / [[[1]], [[np.nan]], [[1]]]}, "field of view of frame 1"),
         (
             {"depth": np.where(np.arange(3)[:, None, None] == 1, np.nan, make_room().depth)},
             r"depth of frame 1 has no finite value, and 1176 of 3528 values .* are not finite; check the weights",
@@ -145,3 +145,93 @@ def test_what_is_no_path_and_no_result_is_named():
     for other in ("demo-output", [make_room()]):
         with pytest.raises(InputError, match=f"a {type(other).__name__} is given to the viewer; expected results"):
             make_room().view(other)  # type: ignore
+
+
+ROOT = Path(__file__).parents[2]
+FRAMES = 6
+LARGE = ("depth", "depth_confidence", "dynamic_mask", "images", "saliency")
+
+
+def mapped(folder, result) -> Reconstruction:
+    """Return the same result with its large arrays in files."""
+    folder.mkdir()
+    arrays = {}
+    for name in LARGE:
+        value = getattr(result, name)
+        arrays[name] = np.lib.format.open_memmap(folder / f"{name}.npy", "w+", value.dtype, value.shape)
+        arrays[name][:] = value
+    return dataclasses.replace(result, **arrays)
+
+
+@pytest.fixture
+def room(monkeypatch):
+    monkeypatch.setattr(archive, "_LEAST_MAPPED", 64)
+    return make_room(FRAMES)
+
+
+@pytest.mark.usefixtures("empty_reports")
+def test_a_mapped_result_writes_the_files_of_one_in_memory_and_opens_lazily(room, tmp_path):
+    room.save(tmp_path / "memory")
+    found = mapped(tmp_path / "arrays", room)
+    assert is_mapped(found.valid_pixels)
+    assert np.array_equal(found.valid_pixels, room.valid_pixels)
+    assert is_mapped(found.instances)
+    found.save(tmp_path / "mapped")
+    again = Reconstruction.load(tmp_path / "mapped")
+    for name in LARGE:
+        value = getattr(again, name)
+        assert is_mapped(value), name
+        assert value.flags.aligned
+        assert np.array_equal(value, getattr(room, name))
+    again.depth[0] = 7  # leaves the file
+    assert np.array_equal(Reconstruction.load(tmp_path / "mapped").depth, room.depth)
+    assert not is_mapped(Reconstruction.load(tmp_path / "memory").depth)
+    there, here = contents(tmp_path / "memory"), contents(tmp_path / "mapped")
+    assert there.keys() == here.keys()
+    assert [name for name in there if there[name] != here[name] and not name.endswith((".npz", ".html"))] == []
+
+
+def test_statistics_of_large_mapped_arrays_are_of_evenly_spread_frames(tmp_path, monkeypatch):
+    values = np.lib.format.open_memmap(tmp_path / "a.npy", "w+", np.float32, (10, 4, 4))
+    values[:] = np.arange(10)[:, None, None]
+    assert spread_frames(values)[0] is values
+    monkeypatch.setattr(archive, "_MOST_SPREAD", 64)
+    few, same = spread_frames(values, np.asarray(values))
+    assert few[:, 0, 0].tolist() == [0, 3, 6, 9]
+    assert np.array_equal(few, same)
+    whole = np.zeros((10, 4, 4), np.float32)
+    assert spread_frames(whole)[0] is whole
+    assert not is_mapped(zeros_beside(whole, bool))
+
+
+@pytest.mark.proof
+def test_two_thousand_frames_open_below_200_megabytes(tmp_path):
+    """The arrays are sparse files of 0.7 GB, all depth 0: unknown."""
+    frames, side = 2000, 160
+    room = make_room(1, side - side % 14, side - side % 14)
+    shape = (frames, *room.depth.shape[1:])
+    fields = {}
+    for name in results.ARRAYS:
+        value = getattr(room, name)
+        if name in LARGE:
+            places = (frames, *value.shape[1:])
+            fields[name] = np.lib.format.open_memmap(tmp_path / f"{name}.npy", "w+", value.dtype, places)
+        elif value is not None:
+            fields[name] = np.repeat(value, frames, axis=0)
+    long = dataclasses.replace(room, **fields, frame_names=tuple(f"{number}" for number in range(frames)))
+    path = tmp_path / "reconstruction.npz"
+    long.save_archive(path)
+    assert path.stat().st_size > 0.5e9
+    code = (
+        "import sys\n"
+        "from vggtjax.storage.process_memory import process_bytes\n"
+        "from vggtjax.results.reconstruction import Reconstruction\n"
+        "result = Reconstruction.load(sys.argv[1])\n"
+        "assert result.depth.shape == (2000, *map(int, sys.argv[2:]))\n"
+        "assert result.depth[1000].max() == 0\n"
+        "print(process_bytes('VmHWM'))\n"
+    )
+    words = [sys.executable, "-c", code, str(path), *map(str, shape[1:])]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) < 200e6

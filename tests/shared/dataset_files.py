@@ -55,10 +55,11 @@ def png(pixels, palette=None) -> bytes:
     chunks = [(b"IHDR", header), (b"IDAT", data), (b"IEND", b"")]
     if palette is not None:
         chunks.insert(1, (b"PLTE", bytes(palette)))
-    parts = (
-        struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body)) for name, body in chunks
-    )
-    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(png_chunk(name, body) for name, body in chunks)
+
+
+def png_chunk(name: bytes, body: bytes) -> bytes:
+    return struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
 
 
 def picture(height=3, width=4) -> bytes:

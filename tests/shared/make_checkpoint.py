@@ -4,81 +4,45 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from math import prod
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
-import tyro
-from rich.progress import Progress
 
-from tests.shared.seeded import seeded_tensor
-from vggtjax.errors import VggtjaxError
-from vggtjax.storage.json_values import read_json
+from tests.shared.seeded import seeded_state_dict, seeded_tensor
 from vggtjax.storage.tensor_file import Spec, write_tensors
-from vggtjax.storage.writing import staging, writing
 
 VGGT_1B = Path(__file__).parents[1] / "golden" / "shapes_vggt_1b.json"
 
 Shapes = Mapping[str, Sequence[int]]
-Make = Callable[[str], np.ndarray]
-
-
-def main(
-    out: Annotated[Path, tyro.conf.Positional],
-    shapes: Path = VGGT_1B,
-    format: Literal["safetensors", "pt"] = "safetensors",
-    shards: int = 1,
-    seed: int = 0,
-) -> None:
-    """Write seeded weights, one tensor in memory at a time.
-
-    Args:
-        out: file to write, or folder for several shards.
-        shapes: JSON object of parameter names -> shapes; VGGT-1B by default.
-        format: of the file; pt needs twice the space while it is written.
-        shards: number of safetensors files, with an index.
-        seed: of the weights.
-    """
-    layout = read_json(shapes, dict[str, list[int]], "shapes")
-    with Progress() as progress:
-        task = progress.add_task(str(out), total=len(layout))
-        make_checkpoint(
-            out, layout, format=format, shards=shards, seed=seed, on_tensor=lambda _: progress.advance(task)
-        )
 
 
 def make_checkpoint(
-    out: Path,
-    shapes: Shapes,
-    *,
-    format: Literal["safetensors", "pt"] = "safetensors",
-    shards: int = 1,
-    seed: int = 0,
-    on_tensor: Callable[[str], object] | None = None,
+    out: Path, shapes: Shapes, *, format: Literal["safetensors", "pt"] = "safetensors", shards: int = 1, seed: int = 0
 ) -> None:
-    """Write the seeded weights of `shapes`, as `main` says; `on_tensor` is called with each name."""
+    """Write the seeded weights of `shapes` into a file, or into a folder for several shards.
 
-    def make(name: str) -> np.ndarray:
-        if on_tensor is not None:
-            on_tensor(name)
-        return seeded_tensor(name, shapes[name], seed)
-
+    Of safetensors one tensor is in memory at a time.
+    """
     if format == "pt":
-        _write_torch(out, shapes, make)
+        import torch
+
+        tensors = seeded_state_dict(shapes, seed)
+        torch.save({name: torch.from_numpy(tensor) for name, tensor in tensors.items()}, out)
     elif shards == 1:
-        _write_safetensors(out, shapes, make)
+        _write_safetensors(out, shapes, seed)
     else:
-        _write_shards(out, shapes, make, shards)
+        _write_shards(out, shapes, shards, seed)
 
 
-def _write_safetensors(path: Path, shapes: Shapes, make: Make) -> None:
+def _write_safetensors(path: Path, shapes: Shapes, seed: int) -> None:
     specs = {name: Spec(tuple(shape), np.dtype(np.float32)) for name, shape in shapes.items()}
-    write_tensors(path, specs, lambda name: [make(name)], {"format": "pt"})
+    write_tensors(path, specs, lambda name: [seeded_tensor(name, shapes[name], seed)], {"format": "pt"})
 
 
-def _write_shards(folder: Path, shapes: Shapes, make: Make, shards: int) -> None:
+def _write_shards(folder: Path, shapes: Shapes, shards: int, seed: int) -> None:
     total = sum(4 * prod(shape) for shape in shapes.values())
     parts: list[dict[str, Sequence[int]]] = [{} for _ in range(shards)]
     done = 0
@@ -88,32 +52,11 @@ def _write_shards(folder: Path, shapes: Shapes, make: Make, shards: int) -> None
     weight_map: dict[str, str] = {}
     for number, part in enumerate(parts, 1):
         shard = f"model-{number:05}-of-{shards:05}.safetensors"
-        _write_safetensors(folder / shard, part, make)
+        _write_safetensors(folder / shard, part, seed)
         weight_map |= dict.fromkeys(part, shard)
-    with writing(folder / "model.safetensors.index.json") as temporary:
-        temporary.write_text(json.dumps({"metadata": {"total_size": total}, "weight_map": weight_map}, indent=2))
-
-
-def _write_torch(path: Path, shapes: Shapes, make: Make) -> None:
-    import torch
-
-    tensors = {}
-    with staging(path.parent) as folder, writing(path) as temporary:
-        for number, (name, shape) in enumerate(shapes.items()):  # each stays in a file, not in memory, until saved
-            tensors[name] = torch.from_file(f"{folder}/{number}", shared=True, size=prod(shape)).reshape(tuple(shape))
-            tensors[name].copy_(torch.from_numpy(make(name)))
-        torch.save(tensors, temporary)
-
-
-def run(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return the exit code: 0, or 2 for bad input or output."""
-    try:
-        tyro.cli(main, prog="python -m tests.shared.make_checkpoint", args=arguments)
-    except VggtjaxError as error:
-        sys.stderr.write(f"make_checkpoint: {error}\n")
-        return 2
-    return 0
+    index = json.dumps({"metadata": {"total_size": total}, "weight_map": weight_map}, indent=2)
+    (folder / "model.safetensors.index.json").write_text(index)
 
 
 if __name__ == "__main__":
-    sys.exit(run())
+    make_checkpoint(Path(sys.argv[1]), json.loads(VGGT_1B.read_text()))

@@ -1,5 +1,6 @@
 """The aggregator, the Gram maps and multi-Otsu again, slow and obvious: numpy, Python loops, no scan, no cond."""
 
+import jax
 import numpy as np
 from scipy.special import erf
 from skimage.filters import threshold_multiotsu
@@ -77,16 +78,11 @@ def aggregate(params, patch_tokens, config: VGGTConfig, grid, dynamic=None, mode
         masked = dynamic is not None and layer < mask_pairs
         if dynamic is not None and masked:
             keys[:, SPECIAL:] = dynamic.reshape(S, P)
-        x = np.stack(
-            [
-                block(x[s], frame_weights, config.num_heads, positions, keys[s] if masked else None, mode)[0]
-                for s in range(S)
-            ]
-        )
+        heads, seen = config.num_heads, keys if masked else [None] * S
+        x = np.stack([block(x[s], frame_weights, heads, positions, seen[s], mode)[0] for s in range(S)])
         frame = x
-        flat, q, k = block(
-            x.reshape(S * T, C), global_weights, config.num_heads, positions * S, keys.ravel() if masked else None, mode
-        )
+        every = keys.ravel() if masked else None
+        flat, q, k = block(x.reshape(S * T, C), global_weights, heads, positions * S, every, mode)
         x = flat.reshape(S, T, C)
         q_all.append(q.reshape(S, T, *q.shape[1:])[:, SPECIAL:])
         k_all.append(k.reshape(S, T, *k.shape[1:])[:, SPECIAL:])
@@ -97,9 +93,7 @@ def aggregate(params, patch_tokens, config: VGGTConfig, grid, dynamic=None, mode
 
 def pick(tree, layer):
     """One layer of a stacked tree."""
-    return {
-        name: pick(leaf, layer) if isinstance(leaf, dict) else np.float64(leaf[layer]) for name, leaf in tree.items()
-    }
+    return jax.tree.map(lambda leaf: np.float64(leaf[layer]), tree)
 
 
 def gram_map(rows, columns, layers, statistic, offsets, gram):

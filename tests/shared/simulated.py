@@ -46,6 +46,5 @@ def simulate(
     first, second = log_precisions(truth, seen)
     draws, rho = jax.random.normal(keys[4], (2, *shape)), truth["correlation"]
     errors = (draws[0], rho * draws[0] + jnp.sqrt(1 - rho * rho) * draws[1])
-    return seen._replace(
-        depth1=depth + noise * errors[0] * jnp.exp(-first / 2), depth2=depth + noise * errors[1] * jnp.exp(-second / 2)
-    ), depth
+    depths = [depth + noise * error * jnp.exp(-claim / 2) for error, claim in zip(errors, (first, second), strict=True)]
+    return seen._replace(depth1=depths[0], depth2=depths[1]), depth

@@ -4,6 +4,7 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from tests.shared.tiny import tiny_config
 from vggtjax.config import VGGTConfig
@@ -14,14 +15,7 @@ from vggtjax.training.metrics import read_metrics
 from vggtjax.training.recipe import OptimiserConfig, Phase, Recipe
 from vggtjax.training.state import Metrics, TrainingState
 
-CONFIG = tiny_config(
-    image_size=28,
-    dpt_channels=(4, 4, 4, 4),
-    track_features=8,
-    track_hidden=16,
-    track_corr_levels=2,
-    track_corr_radius=1,
-)
+CONFIG = tiny_config(image_size=28, dpt_channels=(4, 4, 4, 4))
 RECIPE = Recipe(
     name="tiny",
     stages=(Phase(4, 2, (2, 3), 28, 28, sizes=((28, 42),)), Phase(2, 2, (2,), 28, 42)),
@@ -60,6 +54,10 @@ def train_step(state: TrainingState, batch, recipe: Recipe, objective) -> tuple[
     state, batch = jax.device_put(jax.device_get((state, batch)), placement(recipe).whole)
     metrics, gradient = loop._loss_and_gradient(state.trained, batch, recipe, objective)
     return loop._apply_gradient(state, gradient, metrics, recipe)
+
+
+def same(a, b) -> bool:
+    return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
 
 
 def measured(path):

@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -17,6 +18,22 @@ def picture(index: int) -> np.ndarray:
     pixels[: HEIGHT // 2, :, 2] = 200
     pixels[..., 1] = 10 * index
     return pixels
+
+
+def encode(path: Path, pictures: Iterable[np.ndarray], codec="mpeg4", pixels="yuv420p", *, bits=0, **options) -> Path:
+    """Write pictures [H, W, 3 or 4] by a codec, 25 a second; `bits` a second, and options of the codec."""
+    with av.open(str(path), "w") as container:
+        stream: Any = container.add_stream(codec, rate=25, options=options)
+        first, *others = pictures
+        stream.height, stream.width = first.shape[:2]
+        stream.pix_fmt, stream.bit_rate = pixels, bits
+        for number, values in enumerate((first, *others)):
+            frame = av.VideoFrame.from_ndarray(values, format="rgb24" if values.shape[2] == 3 else "rgba")
+            frame = frame.reformat(format=pixels)
+            frame.pts = number
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return path
 
 
 def write_video(path: Path, times: Iterable[int], size: tuple[int, int] = (WIDTH, HEIGHT), **options: str) -> Path:

@@ -1,5 +1,3 @@
-"""JSON of strangers: every problem is one sentence with its place, the value and what was expected."""
-
 from __future__ import annotations
 
 import math

@@ -1,8 +1,10 @@
-"""Other libraries in the process, in every order of the imports."""
+"""What else is in the process: other libraries, in every order of the imports, and platforms that jax cannot start."""
 
 import importlib.util
+import os
 import subprocess
 import sys
+from functools import partial
 
 import pytest
 
@@ -29,3 +31,19 @@ def test_pictures_and_archives_are_saved_or_the_order_of_imports_is_refused(orde
         assert "put `import vggtjax` before `import pycolmap`" in run.stderr.splitlines()[-1]
     else:
         assert (run.returncode, run.stdout) == (0, "saved\n"), run.stderr
+
+
+@pytest.mark.parametrize(
+    ("platforms", "program"),
+    [
+        ("wrong", "import vggtjax; vggtjax.load_model('demo')"),
+        ("cuda", "from vggtjax.interface.commands.main import main; main(['doctor'])"),
+    ],
+)
+def test_a_platform_that_is_not_there_is_named(platforms, program):
+    run = partial(subprocess.run, env=os.environ | {"JAX_PLATFORMS": platforms}, capture_output=True, text=True)
+    run = run([sys.executable, "-c", program], timeout=100, check=False)
+    if platforms == "cuda" and not run.stderr:
+        pytest.skip("there is a GPU")
+    assert f"jax cannot start on JAX_PLATFORMS={platforms}" in run.stderr
+    assert "unset it" in run.stderr.splitlines()[-1]

@@ -4,6 +4,7 @@ from http.server import BaseHTTPRequestHandler
 
 import pytest
 
+from tests.shared.contents import contents
 from tests.shared.servers import empty_memory, served
 from vggtjax.errors import InputError, OutputError
 from vggtjax.storage import remote
@@ -40,10 +41,6 @@ def memory():
         yield system
 
 
-def tree(folder):
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
 def test_folders_and_files_are_copied_whole_and_the_last_file_comes_last(memory, tmp_path, monkeypatch):
     files = {"a.bin": b"1", "end.npz": b"2" * 100_000, "z/b c#.txt": b"", "z/y/d.txt": b"4"}
     for name, content in files.items():
@@ -57,7 +54,7 @@ def test_folders_and_files_are_copied_whole_and_the_last_file_comes_last(memory,
     assert len(order) == 4
     there = [exists(url) for url in (f"{walk}/end.npz", f"{walk}/z", "memory://results/other/end.npz")]
     assert there == [True, False, False]
-    assert tree(download(walk, tmp_path)) == files
+    assert contents(download(walk, tmp_path)) == files
     assert download(f"{walk}/z/y/d.txt", tmp_path).read_bytes() == b"4"
     found = {entry.name: entry.is_folder for entry in list_url(walk)}
     assert found == {"a.bin": False, "end.npz": False, "z": True}
@@ -86,14 +83,14 @@ def test_a_web_server_is_read_and_what_it_names_stays_in_the_folder(tmp_path):
     for name in ("1 b.png", "deep/2.png"):
         (tmp_path / "site/my walk" / name).write_bytes(name.encode())
     with served(tmp_path / "site") as url:
-        assert tree(download(f"{url}/my%20walk/", tmp_path)) == {"1 b.png": b"1 b.png", "deep/2.png": b"deep/2.png"}
+        assert contents(download(f"{url}/my%20walk/", tmp_path)) == {"1 b.png": b"1 b.png", "deep/2.png": b"deep/2.png"}
         assert (tmp_path / "my walk").is_dir()
         assert download(f"{url}/my%20walk/1%20b.png?key=1", tmp_path).name == "1 b.png"
         with pytest.raises(InputError, match=r"there is nothing at http://127.0.0.1:\d+/none.mp4; check the address"):
             download(f"{url}/none.mp4?key=secret", tmp_path)
     with served(Liar) as url:
         assert sorted(entry.name for entry in list_url(f"{url}/walk")) == ["1.png", "2.png"]
-        assert sorted(tree(download(f"{url}/walk/", tmp_path))) == ["1.png", "2.png"]
+        assert sorted(contents(download(f"{url}/walk/", tmp_path))) == ["1.png", "2.png"]
         with pytest.raises(InputError, match="has more than 100000 bytes; expected at most so many"):
             download(f"{url}/endless.mp4", tmp_path, most_bytes=100_000)
 

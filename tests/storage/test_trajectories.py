@@ -1,5 +1,3 @@
-"""Trajectories as text, written and read."""
-
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -42,12 +40,12 @@ def test_poses_come_back(tmp_path, turn, centre):
 
 
 def test_the_order_of_a_file_is_kept_and_checked(tmp_path):
-    room = make_room()
-    for order in ("xyzw", "wxyz"):
-        write_trajectory(tmp_path / order, room.world_from_camera, np.arange(3.0), quaternion=order)
-        np.testing.assert_allclose(read_trajectory(tmp_path / order, order)[1], room.world_from_camera, atol=1e-6)
+    poses = make_room().world_from_camera
+    for order in ("wxyz", "xyzw"):
+        write_trajectory(tmp_path / "t", poses, np.arange(3.0), quaternion=order)
+        np.testing.assert_allclose(read_trajectory(tmp_path / "t", order)[1], poses, atol=1e-6)
     with pytest.raises(ResultError, match="names its columns qx qy qz qw; read it with quaternion='xyzw'"):
-        read_trajectory(tmp_path / "xyzw", "wxyz")
+        read_trajectory(tmp_path / "t", "wxyz")
 
 
 @pytest.mark.parametrize(

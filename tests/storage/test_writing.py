@@ -1,5 +1,3 @@
-"""Writers: whole files or none, no leftovers of killed writers, one writer for a locked folder."""
-
 import errno
 import os
 import signal
@@ -14,15 +12,8 @@ from pathlib import Path
 import pytest
 
 from vggtjax.errors import OutputError
-from vggtjax.storage.writing import (
-    _remove_leftovers,
-    check_free,
-    locked_folder,
-    says_format,
-    staging,
-    write_errors,
-    writing,
-)
+from vggtjax.storage import writing as module
+from vggtjax.storage.writing import _remove_leftovers, check_free, locked_folder, staging, write_errors, writing
 
 WRITER = """
 import sys, time
@@ -64,12 +55,8 @@ def test_a_file_or_folder_appears_at_the_end(tmp_path):
         (temporary / "c").write_text("whole")
     with pytest.raises(TypeError), writing(tmp_path / "new" / "d") as temporary:
         temporary.write_text(3)  # pyright: ignore[reportArgumentType]: it makes the file, then fails
-    assert sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")) == [
-        "new",
-        "new/a.txt",
-        "new/b",
-        "new/b/c",
-    ]
+    there = [path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")]
+    assert sorted(there) == ["new", "new/a.txt", "new/b", "new/b/c"]
     with pytest.raises(OutputError, match=r"cannot write .*a\.txt/e"), writing(tmp_path / "new/a.txt/e"):
         pass
 
@@ -161,16 +148,10 @@ def test_an_error_names_what_is_in_the_way(tmp_path):
     (tmp_path / "link").symlink_to("nowhere")
     (tmp_path / "there").symlink_to("file")
     os.mkfifo(tmp_path / "pipe")
-    for name, kind in (
-        ("file", "a file"),
-        ("there", "a file"),
-        ("link", "a link to nowhere, which does not exist"),
-        ("pipe", "not a folder"),
-    ):
-        with (
-            pytest.raises(OutputError, match=f"{name}/new: .*/{name} is {kind}; choose"),
-            staging(tmp_path / name / "new"),
-        ):
+    there = {"file": "a file", "there": "a file", "link": "a link to nowhere, which does not", "pipe": "not a folder"}
+    for name, kind in there.items():
+        refused = pytest.raises(OutputError, match=f"{name}/new: .*/{name} is {kind}")
+        with refused, staging(tmp_path / name / "new"):
             pass
     for error in (OSError(errno.ENOSPC, "No space left"), OSError("No space left")):  # with and without a number
         with pytest.raises(OutputError, match=f"cannot write {tmp_path}: No space left; "), write_errors(tmp_path):
@@ -180,7 +161,7 @@ def test_an_error_names_what_is_in_the_way(tmp_path):
 @pytest.mark.parametrize(("text", "says"), [('{"format": "clip"}', True), ('{"format": "mask"}', False), ("[", False)])
 def test_a_file_says_its_format(tmp_path, text, says):
     (tmp_path / "a.json").write_text(text)
-    assert says_format(tmp_path / "a.json", "clip") is says
+    assert module.says_format(tmp_path / "a.json", "clip") is says
 
 
 def test_a_check_finds_files_that_may_not_be_replaced_and_leaves_nothing(tmp_path):

@@ -1,4 +1,4 @@
-"""Batches: regions of suppressed keys, their share of the clips and effect on the network."""
+"""Batches and what is minimised: regions of suppressed keys and their effect; terms that can be computed by hand."""
 
 import dataclasses
 from functools import partial
@@ -19,7 +19,7 @@ from vggtjax.network.heads.camera_head import predict_pose
 from vggtjax.network.model import init_params
 from vggtjax.network.suppression import Suppression
 from vggtjax.training.data import make_batch
-from vggtjax.training.objective import LossWeights, init_probes, objective
+from vggtjax.training.objective import LossWeights, _flow_moments, init_probes, objective
 from vggtjax.training.recipe import Phase
 from vggtjax.training.regions import random_regions
 from vggtjax.training.truth import targets
@@ -60,9 +60,8 @@ def test_regions_are_compact_and_move():
     assert 0.05 < shares.mean() < 0.35
     assert shares.max() < 2 * 0.7**2
     assert np.mean(np.any(regions[:, 0] != regions[:, -1], axis=(1, 2))) > 0.95
-    alone = [
-        clip for clip in regions if clip.any((1, 2)).all() and not (clip[:, [0, -1]].any() | clip[..., [0, -1]].any())
-    ]
+    rims = regions[:, :, [0, -1]].any((1, 2, 3)) | regions[..., [0, -1]].any((1, 2, 3))
+    alone = regions[regions.any((2, 3)).all(-1) & ~rims]
     centres = np.array([[ndimage.center_of_mass(frame) for frame in clip] for clip in alone])
     assert len(alone) > 2
     assert np.abs(np.diff(centres, 2, axis=1)).max() < 1.5
@@ -92,12 +91,44 @@ def test_the_objective_suppresses_keys_as_a_second_pass_does(batch, trained, sup
         patches = encode(model, clips.images, CONFIG)
         grid = patch_grid(clips.images, CONFIG)
         suppression = Suppression(tokens, suppress, pairs)
-        camera, _, _ = aggregate(
-            model, patches, CONFIG, grid, captures=[identity] * len(CONFIG.taps), suppression=suppression
-        )
+        captures = [identity] * len(CONFIG.taps)
+        camera, _, _ = aggregate(model, patches, CONFIG, grid, captures=captures, suppression=suppression)
         error = jnp.abs(predict_pose(model, camera, CONFIG) - targets(clips).pose_encoding)
         return error[..., :3].sum(axis=-1).mean()
 
     found = float(terms(trained, batch)["loss_translation"])
     assert found == pytest.approx(float(translation_loss(tokens)), rel=1e-5)
     assert abs(float(translation_loss(jnp.zeros_like(tokens))) - found) > 1e-5
+
+
+def test_moments_of_the_flow_by_hand():
+    place = np.array([[-0.5, -0.5], [0.5, -0.5], [-0.5, 0.5], [0.5, 0.5]], np.float32)[None, None]
+    flow = np.zeros((1, 2, 4, 2), np.float32)
+    flow[0, 1] = [[0.2, 0.0], [0.4, 0.0], [0.2, -0.1], [9.0, 9.0]]
+    depth_inverse = np.array([1.0, 2.0, 10.0, 1.0], np.float32)  # 10 counts as 4
+    seen = np.array([True, True, True, False])  # the flow of what is not seen does not count
+    made, known = _flow_moments(
+        jnp.asarray(flow),
+        jnp.asarray(place),
+        jnp.broadcast_to(jnp.asarray(depth_inverse), (1, 2, 4)),
+        jnp.broadcast_to(jnp.asarray(seen)[None, None, :, None], (1, 2, 4, 1)),
+    )
+    expected = [
+        [0.8 / 3, -0.1 / 3],  # flow
+        [(0.2 + 0.8 + 0.8) / 3, -0.4 / 3],  # times inverse depth
+        [(-0.1 + 0.2 - 0.1) / 3, 0.05 / 3],  # times x
+        [(-0.1 - 0.2 + 0.1) / 3, -0.05 / 3],  # times y
+        [7 / 3, 21 / 3],  # inverse depth and its square
+    ]
+    assert np.allclose(made[0, 1], np.ravel(expected), atol=1e-6)
+    assert np.allclose(made[0, 0, :8], 0)
+    assert known.all()
+
+
+def test_moments_of_too_few_patches_are_not_known():
+    seen = np.zeros((1, 1, 4, 1), bool)
+    seen[0, 0, :2] = True
+    zeros = jnp.zeros((1, 1, 4, 2))
+    made, known = _flow_moments(zeros, zeros, jnp.ones((1, 1, 4)), jnp.asarray(seen))
+    assert not known.any()
+    assert np.isfinite(made).all()

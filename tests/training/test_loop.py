@@ -1,32 +1,31 @@
-"""The loop of a training run: what it leaves, exact resume and signals."""
+"""The loop of a training run: what it leaves, exact resume, signals, its metrics, and where it computes."""
 
 import dataclasses
+import math
 import os
 import shutil
 import signal
+import subprocess
+import sys
+from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.shared.training_runs import PROBES, SHORT, TASK, measured
+from tests.shared.training_runs import PROBES, SHORT, TASK, measured, same
 from vggtjax.errors import InputError, OutputError, VggtjaxError
 from vggtjax.network.checkpoint import read_model
 from vggtjax.network.model import init_params
 from vggtjax.training.checkpoints import latest
 from vggtjax.training.loop import draw_shape, train
-from vggtjax.training.metrics import read_metrics
+from vggtjax.training.metrics import Averages, read_metrics, write_metrics
 from vggtjax.training.options import RunOptions
 from vggtjax.training.recipe import Phase, read_recipe
 from vggtjax.training.run import MOST_SKIPPED
 from vggtjax.training.state import exported
 
 NOW = 1e-9  # seconds: a run that ends after one step
-
-
-def same(a, b) -> bool:
-    return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
 
 
 @pytest.fixture(scope="module")
@@ -47,9 +46,8 @@ def test_what_a_run_leaves(straight):
     outcome, out, seen = straight
     assert outcome.finished
     assert int(outcome.state.step) == 6
-    assert {path.name for path in out.iterdir()} == {
-        "checkpoints", "metrics.csv", "metrics.png", "model.safetensors", "recipe.json",
-    }  # fmt: skip
+    files = "checkpoints metrics.csv metrics.png model.safetensors recipe.json"
+    assert {path.name for path in out.iterdir()} == {*files.split()}
     rows = read_metrics(out / "metrics.csv")
     assert [(row["step"], row["stage"], row["samples"]) for row in rows] == [(2, 0, 4), (4, 0, 8), (6, 1, 12)]
     assert rows[2]["loss"] < rows[0]["loss"]
@@ -132,9 +130,64 @@ def test_frames_and_sizes_depend_on_seed_and_step_alone():
     assert [frames for frames, *_ in alone] == [frames for frames, *_ in shapes]
 
 
-def test_bad_arguments(tmp_path):
-    with pytest.raises(InputError, match="dtype is 'float16'"):
-        RunOptions(dtype="float16")  # type: ignore[arg-type]
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="cannot write"):
-        train(SHORT, tmp_path / "file", task=TASK)
+CODE = """
+import dataclasses, jax, numpy as np
+from tests.shared.training_runs import RECIPE
+from vggtjax.training.devices import placement
+def placed(*sizes):
+    stages = tuple(dataclasses.replace(stage, batch=size) for stage, size in zip(RECIPE.stages, sizes))
+    return placement(dataclasses.replace(RECIPE, stages=stages))
+
+where = placed(4, 2)
+print(len(placed(2, 1).whole.device_set), len(where.whole.mesh.devices))
+print(jax.device_put(np.ones((4, 3)), where.by_clip).addressable_shards[0].data.shape)
+"""
+
+
+def test_the_most_devices_that_divide_every_batch():
+    """One for batches of 2 and 1; two of three for batches of 4 and 2."""
+    environment = {"XLA_FLAGS": "--xla_force_host_platform_device_count=3", "PATH": ""}
+    environment["PYTHONPATH"] = str(Path(__file__).parents[2])
+    made = subprocess.run([sys.executable, "-c", CODE], env=environment, capture_output=True, text=True, check=False)
+    assert made.returncode == 0, made.stderr
+    assert made.stdout.split("\n")[:2] == ["1 2", "(2, 3)"]
+
+
+def row(step, **metrics):
+    return {"step": step, "stage": 0, "seconds": step / 3, "samples": 2 * step, **metrics}
+
+
+def test_averages():
+    averages = Averages()
+    averages.add({"loss": 1.0, "depth": 4.0})
+    averages.add({"loss": math.nan, "skipped": 1.0}, finite_only=True)
+    averages.add({"loss": 2.0})
+    assert averages.take() == {"loss": 1.5, "depth": 4.0, "skipped": 1.0}
+    averages.add({"loss": math.inf})
+    assert averages.take() == {"loss": math.inf}
+
+
+def test_rows_of_different_metrics_share_a_table(tmp_path):
+    path = tmp_path / "metrics.csv"
+    rows = [row(1, loss=0.5), row(2, loss=0.25, match=1.0), row(3, match=0.5)]
+    write_metrics(path, rows)
+    rest = [f"1,0,{1 / 3!r},2,0.5,", f"2,0,{2 / 3!r},4,0.25,1.0", "3,0,1.0,6,,0.5"]
+    assert path.read_text().splitlines() == ["step,stage,seconds,samples,loss,match", *rest]
+    assert read_metrics(path) == rows
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (b"", "does not begin with the columns"),
+        (b"\xff\xfe\n", "is no CSV file"),
+        (b"step,stage,seconds,samples\n1,2,x,4\n2,0,1,4\n", "line 2"),
+    ],
+)
+def test_other_files_are_refused(tmp_path, content, says):
+    path = tmp_path / "metrics.csv"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=says):
+        read_metrics(path)
+    with pytest.raises(InputError, match="cannot read"):
+        read_metrics(tmp_path / "none.csv")

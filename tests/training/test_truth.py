@@ -30,12 +30,8 @@ def found(clip):
 
 def doubled(clip):
     """Everything that is computed with, in float64."""
-    return clip._replace(
-        **{
-            name: getattr(clip, name).astype(np.float64)
-            for name in ("depth", "scene_flow", "camera_from_world", "intrinsics", "world_from_part")
-        }
-    )
+    names = ("depth", "scene_flow", "camera_from_world", "intrinsics", "world_from_part")
+    return clip._replace(**{name: getattr(clip, name).astype(np.float64) for name in names})
 
 
 def world_points(clip):
@@ -182,10 +178,6 @@ def slow_match_loss(matches, q, k):
     return -np.mean(to_first) - np.mean(to_each), np.mean(right)
 
 
-def quick_match_loss(found, q, k):
-    return match_loss(found, match_counts(found), q, k)
-
-
 def log_softmax(x):
     return x - x.max() - np.log(np.exp(x - x.max()).sum())
 
@@ -195,12 +187,12 @@ def test_match_loss_against_a_slow_one_and_of_nothing_that_is_seen():
     B, S, P, D, heads = 2, 3, 4, 8, 5
     q, k = (jnp.asarray(generator.normal(0, 2, (B, S, P, heads, D)), jnp.float32) for _ in range(2))
     found = random_matches(generator, B, S, P)
-    loss, accuracy = quick_match_loss(found, q, k)
+    loss, accuracy = match_loss(found, match_counts(found), q, k)
     expected = slow_match_loss(found, q, k)
     assert (float(loss), float(accuracy)) == pytest.approx(expected, rel=1e-5)
     assert 0 < expected[1] < 1
     unseen = found._replace(visible=jnp.zeros_like(found.visible))
-    assert [float(x) for x in quick_match_loss(unseen, q, k)] == [0, 0]
+    assert [float(x) for x in match_loss(unseen, match_counts(unseen), q, k)] == [0, 0]
 
 
 def test_the_loss_of_layers_is_the_mean_of_those_that_are_supervised():

@@ -5,7 +5,9 @@ origin or a wrong picture no longer projects the points onto the squares.
 """
 
 import json
+import struct
 import zipfile
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -165,35 +167,37 @@ def nerfstudio(folder: Path, truth: Truth, *, top: dict | None = None, frame_fie
     return folder
 
 
-def colmap_text(folder: Path, truth: Truth, model: str = "sparse/0") -> Path:
-    """https://colmap.github.io/format.html, with an image without points."""
-    cameras, images = ["# Camera list", ""], ["# Image list", "#   IMAGE_ID, QW, ..."]
+def write_colmap(
+    model: Path, truth: Truth, frames: Iterable[int] = range(FRAMES), points: int = 0, form: str = ".txt"
+) -> None:
+    """Write a model of some of the frames: https://colmap.github.io/format.html, with an image without points."""
+    cameras, images = [], []
+    for frame in frames:
+        K, rotation = truth.intrinsics[frame], truth.world_from_camera[frame, :3, :3].T
+        cameras.append((frame + 1, 1, WIDTH, HEIGHT, [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]))
+        quaternion = Rotation.from_matrix(rotation).as_quat(scalar_first=True)
+        centre = truth.world_from_camera[frame, :3, 3]
+        images.append((40 - frame, quaternion, -rotation @ centre, frame + 1, f"view_{8 + frame}.png"))
+    model.mkdir(parents=True, exist_ok=True)
+    if form == ".bin":
+        contents = {"cameras": cameras_bin(cameras), "images": images_bin(images)}
+        contents["points3D"] = struct.pack("<Q", points)
+    else:
+        rows = [f"{number} PINHOLE {w} {h} {' '.join(map(str, values))}" for number, _, w, h, values in cameras]
+        lines = ["# Image list", "#   IMAGE_ID, QW, ..."]
+        for number, quaternion, place, camera, name in images:
+            lines.append(f"{number} {' '.join(map(str, (*quaternion, *place)))} {camera} {name}")
+            lines.append("" if camera == 2 else "1.5 2.5 -1 3.5 4.5 7")
+        texts = {"cameras": ["# Camera list", "", *rows], "images": lines, "points3D": ["1 0 0 1 9 9 9 -1"] * points}
+        contents = {name: ("\n".join(text) + "\n").encode() for name, text in texts.items()}
+    for name, content in contents.items():
+        (model / f"{name}{form}").write_bytes(content)
+
+
+def colmap_text(folder: Path, truth: Truth, model: str = "sparse/0", form: str = ".txt") -> Path:
     for frame in range(FRAMES):
         draw(truth, frame, folder / f"images/view_{8 + frame}.png")
-        K, pose = truth.intrinsics[frame], truth.world_from_camera[frame]
-        cameras.append(f"{frame + 1} PINHOLE {WIDTH} {HEIGHT} {K[0, 0]} {K[1, 1]} {K[0, 2]} {K[1, 2]}")
-        rotation = pose[:3, :3].T
-        values = [*Rotation.from_matrix(rotation).as_quat(scalar_first=True), *(-rotation @ pose[:3, 3])]
-        images.append(f"{40 - frame} {' '.join(map(repr, map(float, values)))} {frame + 1} view_{8 + frame}.png")
-        images.append("" if frame == 1 else "1.5 2.5 -1 3.5 4.5 7")
-    (folder / model).mkdir(parents=True)
-    (folder / model / "cameras.txt").write_text("\n".join(cameras) + "\n")
-    (folder / model / "images.txt").write_text("\n".join(images) + "\n")
-    return folder
-
-
-def colmap_binary(folder: Path, truth: Truth) -> Path:
-    """The same model as COLMAP writes it by default, without points."""
-    colmap_text(folder, truth)
-    cameras, images = [], []
-    for frame, (K, pose) in enumerate(zip(truth.intrinsics, truth.world_from_camera, strict=True)):
-        cameras.append((frame + 1, 1, WIDTH, HEIGHT, [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]))
-        rotation = pose[:3, :3].T
-        quaternion = Rotation.from_matrix(rotation).as_quat(scalar_first=True)
-        images.append((40 - frame, quaternion, -rotation @ pose[:3, 3], frame + 1, f"view_{8 + frame}.png"))
-    for name, content in (("cameras", cameras_bin(cameras)), ("images", images_bin(images)), ("points3D", bytes(8))):
-        (folder / f"sparse/0/{name}.txt").unlink(missing_ok=True)
-        (folder / f"sparse/0/{name}.bin").write_bytes(content)
+    write_colmap(folder / model, truth, form=form)
     return folder
 
 

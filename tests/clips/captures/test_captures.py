@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import struct
 import zipfile
 from typing import Any
 
@@ -12,7 +11,6 @@ from PIL import Image
 
 from tests.clips.captures import folders
 from tests.clips.captures.folders import FRAMES, HEIGHT, WIDTH, make_truth
-from tests.shared.dataset_files import cameras_bin, images_bin
 from vggtjax.cameras import project
 from vggtjax.clips.captures.cameras import DISTORTED
 from vggtjax.clips.captures.table import KINDS, find_capture, read_capture
@@ -62,7 +60,6 @@ def check(capture, truth, *, smaller=1, sure=10.0, atol=1e-6):
 @pytest.mark.parametrize("kind", KINDS)
 def test_points_fall_on_their_squares(tmp_path, kind):
     capture = find(write(kind, tmp_path / "scene"))
-    assert capture is not None
     assert capture.kind == kind
     assert list(capture.frame_names) == NAMES[kind]
     arkit = kind in ("record3d", "polycam")
@@ -117,8 +114,7 @@ def test_polycam_s_own_cameras_stand_in_for_optimised_ones(tmp_path):
     edited(first, k1=0.1, p2=0.01)
     K = TRUTH.intrinsics[0] if first.stem == capture.frame_names[0] else None
     lens = next(filter(None, read(tmp_path).lenses))
-    assert lens.model == "OPENCV"
-    assert lens.params[4:] == (0.1, 0, 0, 0.01)
+    assert (lens.model, lens.params[4:]) == ("OPENCV", (0.1, 0, 0, 0.01))
     assert K is None or lens.params[:4] == (K[0, 0], K[1, 1], K[0, 2], K[1, 2])
 
 
@@ -166,29 +162,6 @@ def test_places_of_a_colmap_model(tmp_path, model, caplog):
     assert caplog.text.count(note) == 1
 
 
-def part_of(folder, number, frames, points=0, form=".txt"):
-    """Add a model of some of the frames to a folder that has a whole one in sparse/whole."""
-    model = folder / "sparse" / number if number else folder / "sparse"
-    model.mkdir(parents=True, exist_ok=True)
-    lines = (folder / "whole/images.txt").read_text().splitlines()
-    if form == ".txt":
-        shutil.copy(folder / "whole/cameras.txt", model / "cameras.txt")
-        kept = [line for frame in frames for line in lines[2 + 2 * frame : 4 + 2 * frame]]
-        (model / "images.txt").write_text("\n".join(kept) + "\n")
-        (model / "points3D.txt").write_text("# points\n" + "1 0 0 1 9 9 9 -1\n" * points)
-        return
-    cameras, images = [], []
-    for frame in frames:
-        words = lines[2 + 2 * frame].split()
-        K = TRUTH.intrinsics[frame]
-        cameras.append((frame + 1, 1, WIDTH, HEIGHT, [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]))
-        values = [float(word) for word in words[1:8]]
-        images.append((frame + 1, values[:4], values[4:], frame + 1, words[9]))
-    (model / "cameras.bin").write_bytes(cameras_bin(cameras))
-    (model / "images.bin").write_bytes(images_bin(images))
-    (model / "points3D.bin").write_bytes(struct.pack("<Q", points))
-
-
 @pytest.mark.parametrize(
     ("parts", "taken"),
     [
@@ -202,7 +175,7 @@ def part_of(folder, number, frames, points=0, form=".txt"):
 def test_of_several_colmap_models_that_with_most_pictures_is_read(tmp_path, caplog, parts, taken):
     folders.colmap_text(tmp_path, TRUTH, "whole")
     for number, part in parts.items():
-        part_of(tmp_path, number, *part)
+        folders.write_colmap(tmp_path / "sparse" / number, TRUTH, *part)
     capture = read(tmp_path)
     check(capture, TRUTH)
     (note,) = capture.notes
@@ -216,13 +189,13 @@ def test_of_several_colmap_models_that_with_most_pictures_is_read(tmp_path, capl
 
 def test_pictures_that_are_not_there_do_not_count_and_a_broken_model_is_no_choice(tmp_path):
     folders.colmap_text(tmp_path, TRUTH, "whole")
-    part_of(tmp_path, "0", range(FRAMES))
+    folders.write_colmap(tmp_path / "sparse/0", TRUTH)
     lost = (tmp_path / "sparse/0/images.txt").read_text()
     for frame in range(8, 11):
         lost = lost.replace(f"view_{frame}.png", f"lost_{frame}.png")
     (tmp_path / "sparse/0/images.txt").write_text(lost)  # one picture of it is there
-    part_of(tmp_path, "1", [0, 2])
-    part_of(tmp_path, "3", [0, 2], form=".bin")
+    for number, form in (("1", ".txt"), ("3", ".bin")):
+        folders.write_colmap(tmp_path / "sparse" / number, TRUTH, [0, 2], form=form)
     (tmp_path / "sparse/3/images.bin").write_bytes(b"short")
     capture = read(tmp_path)
     assert capture.frame_names == ("view_8", "view_10")
@@ -233,8 +206,7 @@ def test_pictures_that_are_not_there_do_not_count_and_a_broken_model_is_no_choic
 def test_frames_keep_their_cameras_by_name(tmp_path):
     folder = write("nerfstudio", tmp_path / "scene")
     clip = load_clip(folder, size=28, patch=14, start=1, stride=2)
-    assert clip.frame_names == ["frame_9", "frame_11"]
-    assert clip.source.name == "scene"
+    assert (clip.frame_names, clip.source.name) == (["frame_9", "frame_11"], "scene")
     chosen = read(folder).for_frames(reversed(clip.frame_names))
     np.testing.assert_array_equal(chosen.intrinsics, TRUTH.intrinsics[[3, 1]])
     np.testing.assert_allclose(chosen.world_from_camera, TRUTH.world_from_camera[[3, 1]])
@@ -263,29 +235,22 @@ def test_equal_stems_of_two_folders_are_told_apart(tmp_path):
     assert [frame.name for frame in open_source(str(folder)).frames(Sampling())] == ["a_0", "a_1", "b_0", "b_1"]
 
 
-def test_pictures_stored_upside_down_are_refused(tmp_path):
-    folder = write("nerfstudio", tmp_path / "scene")
-    path = folder / "images/frame_9.png"
-    with Image.open(path) as picture:
-        picture.load()
-        picture.getexif()[0x0112] = 3
-        picture.save(path, exif=picture.getexif())
-    with pytest.raises(InputError, match=r"frame_9\.png is stored upside down or mirrored"):
-        read(folder)
-
-
-@pytest.mark.parametrize("kind", ["nerfstudio", "colmap"])
-@pytest.mark.parametrize("orientation", [6, 8])
-def test_cameras_of_stored_pixels_name_exif(tmp_path, kind, orientation):
+@pytest.mark.parametrize(
+    ("kind", "orientation", "words"),
+    [
+        ("nerfstudio", 3, "is stored upside down or mirrored"),
+        ("nerfstudio", 6, "stored on their side are read upright, as their EXIF .*mogrify -auto-orient"),
+        ("colmap", 8, "stored on their side are read upright"),
+    ],
+)
+def test_cameras_of_stored_pixels_name_exif(tmp_path, kind, orientation, words):
     folder = write(kind, tmp_path / "scene")
     path = next(folder.rglob("*.png"))
-    with Image.open(path) as opened:
-        opened.load()
-        opened.getexif()[0x0112] = orientation
-        opened.save(path, exif=opened.getexif())
-    with pytest.raises(
-        InputError, match=r"stored on their side are read upright, as their EXIF .*mogrify -auto-orient"
-    ):
+    with Image.open(path) as picture:
+        picture.load()
+        picture.getexif()[0x0112] = orientation
+        picture.save(path, exif=picture.getexif())
+    with pytest.raises(InputError, match=words):
         read(folder)
 
 
@@ -359,9 +324,8 @@ BROKEN = [
 def test_a_broken_capture_is_refused_in_one_sentence(tmp_path, kind, spoil, words):
     folder = write(kind, tmp_path / "scene")
     spoil(folder)
-    with pytest.raises(InputError, match=words) as problem:
+    with pytest.raises(InputError, match=words):
         find(folder)
-    assert "\n" not in str(problem.value)
     with pytest.raises(ClipError, match="name the folder of the pictures to leave its cameras out"):
         open_source(str(folder))
 
@@ -390,11 +354,7 @@ def test_depth_of_record3d_is_bounded_and_needs_its_extra(tmp_path, monkeypatch)
     capture = read(folder)
     path = folder / "rgbd/0.depth"
     large = lzfse.compress(bytes(100_000))
-    for data, words in (
-        (b"bvx2" * 40, "is not a map of"),
-        (b"bvx2" + bytes(40), "cannot"),
-        (large, "36 x 48 values"),
-    ):
+    for data, words in ((b"bvx2" * 40, "is not a map of"), (b"bvx2" + bytes(40), "cannot"), (large, "36 x 48 values")):
         path.write_bytes(data)  # each block of the first could hold 26 MB
         with pytest.raises(InputError, match=words):
             capture.depth(0)

@@ -1,18 +1,13 @@
-"""COLMAP models byte by byte, and files that are none; depth files that are none."""
-
 import struct
 
 import numpy as np
 import pytest
 
-from tests.shared.dataset_files import QUARTER_ABOUT_Y, cameras_bin, images_bin, npy, write
+from tests.shared.dataset_files import QUARTER_ABOUT_Y, cameras_bin, images_bin, write
 from vggtjax.clips.captures.colmap_model import read_views
-from vggtjax.clips.captures.depth_files import read_npy
 from vggtjax.errors import InputError
 
 HALF = 0.5**0.5
-
-
 IMAGE = (7, (1, 0, 0, 0), (1, 2, 3), 5, "a.png")
 
 
@@ -58,11 +53,3 @@ def test_broken_colmap_models_are_refused(tmp_path, camera, images, message):
     write(tmp_path / "images.bin", images)
     with pytest.raises(InputError, match=message):
         read_views(tmp_path)
-
-
-def test_arrays_that_are_no_depth_are_refused(tmp_path):
-    python = b"\x93NUMPY\x01\x00;\x00{'descr': '|O', 'fortran_order': False, 'shape': (1,), }  \n\x80\x04."
-    whole = npy(np.ones((3, 4), np.float32))
-    for content in (whole[:-1], npy(np.ones((3, 4, 2))), npy(np.ones((3, 4), bool)), python):
-        with pytest.raises(InputError, match=r"a\.npy"):
-            read_npy(write(tmp_path / "a.npy", content))

@@ -23,24 +23,21 @@ def field(time, left=0):
 
 
 def write(path, codec, pixel, first_field):
-    """Write frames of two fields each; `first_field` is 0 for the upper one, None for whole frames."""
+    """Write frames of two fields each; `first_field` is 0 for the upper one."""
     with av.open(str(path), "w") as container:
         stream: Any = container.add_stream(codec, rate=25)
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, pixel
         coder = stream.codec_context
         coder.bit_rate, coder.colorspace, coder.color_primaries, coder.color_trc = 4_000_000, 1, 1, 1
-        if first_field is not None:
-            coder.flags |= int(Flags.interlaced_dct) | int(Flags.interlaced_me)
+        coder.flags |= int(Flags.interlaced_dct) | int(Flags.interlaced_me)
         for index in range(COUNT):
             pixels = field(2 * index % 10)
-            if first_field is not None:
-                pixels[1 - first_field :: 2] = field(2 * index % 10 + 1)[1 - first_field :: 2]
+            pixels[1 - first_field :: 2] = field(2 * index % 10 + 1)[1 - first_field :: 2]
             whole = av.VideoFrame.from_ndarray(pixels, format="rgb24")
             frame = whole.reformat(format="yuv444p", dst_colorspace=1)  # chroma of lines of other times is not mixed
             if pixel != "yuv444p":
                 frame = frame.reformat(format=pixel, dst_colorspace=1)
-            if first_field is not None:
-                frame = marked(frame, ("tff", "bff")[first_field])
+            frame = marked(frame, ("tff", "bff")[first_field])
             frame.pts, frame.time_base = index, Fraction(1, 25)
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
@@ -82,9 +79,3 @@ def test_interlaced_videos_lose_their_combs(tmp_path, caplog, ending, codec, pix
         assert combs(pixels) < 60
         assert np.abs(pixels[20:44, 8 * (2 * index % 10) + 2 : 8 * (2 * index % 10) + 6].astype(int) - 220).max() < 30
     assert caplog.messages == [f"{path} is interlaced; its frames are deinterlaced, one for each pair of fields"]
-
-
-def test_progressive_videos_are_left_as_they_are(tmp_path, caplog):
-    path = write(tmp_path / "a.mp4", "libx264", "yuv420p", None)
-    assert len(list(VideoFile(path).frames(Sampling()))) == COUNT
-    assert not caplog.messages

@@ -1,5 +1,3 @@
-"""Frames of video files: which, when, which way up, and files that break off."""
-
 import gc
 import struct
 
@@ -8,7 +6,7 @@ import numpy as np
 import pytest
 from av.stream import Disposition
 
-from tests.shared.videos import HEIGHT, WIDTH, picture, write_video
+from tests.shared.videos import HEIGHT, WIDTH, encode, picture, write_video
 from vggtjax.clips.media.sampling import Sampling
 from vggtjax.clips.media.video import VideoFile, upright
 from vggtjax.errors import ClipError
@@ -129,13 +127,11 @@ def test_files_that_are_no_video(tmp_path, even):
 
 
 def test_a_playlist_is_not_followed(tmp_path, even):
-    path = tmp_path / "list.mp4"
-    path.write_text(f"ffconcat version 1.0\nfile {even}\n")
-    with pytest.raises(ClipError, match="cannot read video"):
-        read(path)
-    path.write_text(f"#EXTM3U\n#EXT-X-TARGETDURATION:2\n#EXTINF:2,\n{even}\n#EXT-X-ENDLIST\n")
-    with pytest.raises(ClipError, match="cannot read video"):
-        read(path)
+    path, entry = tmp_path / "list.mp4", f"#EXTINF:2,\n{even}\n#EXT-X-ENDLIST\n"
+    for text in (f"ffconcat version 1.0\nfile {even}\n", f"#EXTM3U\n#EXT-X-TARGETDURATION:2\n{entry}"):
+        path.write_text(text)
+        with pytest.raises(ClipError, match="cannot read video"):
+            read(path)
 
 
 def test_sound_and_a_cover_are_no_video(tmp_path):
@@ -184,11 +180,7 @@ def test_what_is_transparent_is_white_as_in_pictures(tmp_path, codec, pixels):
     path = tmp_path / "a.mov"
     colours = np.dstack([picture(5), np.full((HEIGHT, WIDTH), 255, np.uint8)])
     colours[:, WIDTH // 2 :, 3] = 0
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream(codec, rate=10)
-        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, pixels
-        container.mux(stream.encode(av.VideoFrame.from_ndarray(colours, format="rgba").reformat(format=pixels)))
-        container.mux(stream.encode())
+    encode(path, [colours], codec, pixels)
     frame = np.asarray(read(path)[0].image).astype(int)
     is_clear = codec != "png"
     np.testing.assert_allclose(frame[:, WIDTH // 2 + 4 :], 255 if is_clear else picture(5)[:, WIDTH // 2 + 4 :], atol=6)

@@ -57,9 +57,8 @@ def sized(
         length -= counted
         length = length if 0 <= length <= len(content) - start else len(content) - start
         place = at + width if size_first else at
-        return Record(
-            content[place : place + head], content[start : start + length], start + length + length % 2 * even
-        )
+        end = start + length
+        return Record(content[place : place + head], content[start:end], end + length % 2 * even)
 
     def join(name: bytes, body: bytes) -> bytes:
         length = struct.pack(size, (len(body) + counted) % 256**width)

@@ -33,11 +33,8 @@ def change_json(content: bytes, random: Random) -> bytes:
 def mutated_json(value: Any, random: Random) -> str:
     """Return the text of a value with one node changed: replaced, left out, doubled, renamed or wrapped."""
     value = {"": value}
-    nodes = [
-        (parent, key)
-        for parent in _containers(value)
-        for key in (parent if isinstance(parent, dict) else range(len(parent)))
-    ]
+    places = [(parent, parent if isinstance(parent, dict) else range(len(parent))) for parent in _containers(value)]
+    nodes = [(parent, key) for parent, keys in places for key in keys]
     parent, key = random.choice(nodes)
     raw = random.choice(_RAW)
     choice = random.randrange(8)

@@ -5,12 +5,10 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
-from fractions import Fraction
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-import av
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -24,6 +22,7 @@ from tests.research.evaluation.datasets.test_open import davis_folder, plain_fol
 from tests.research.evaluation.datasets.test_tum import tum_folder
 from tests.results.test_foreign import QUATERNIONS, WRITERS
 from tests.shared.dataset_files import depth_png, dpt, npy, png, write
+from tests.shared.videos import encode
 from vggtjax.clips.captures.depth_files import read_dpt, read_exr, read_npy, read_png
 from vggtjax.clips.captures.table import read_capture
 from vggtjax.clips.clip import Clip, load_clip
@@ -79,16 +78,9 @@ def picture(folder: Path, *, name: str) -> Path:
 
 def video(folder: Path, *, suffix: str) -> Path:
     """Write five frames of a video."""
-    path, codec = folder / f"video{suffix}", _CODECS[suffix]
-    with av.open(str(path), "w") as container:
-        stream: Any = container.add_stream(codec, rate=25)
-        stream.width, stream.height = 64, 48
-        stream.pix_fmt = "rgb8" if codec == "gif" else "yuv420p"
-        stream.codec_context.time_base = Fraction(1, 25)
-        for number in range(5):
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels(number, 48, 64), format="rgb24")))
-        container.mux(stream.encode())
-    return path
+    codec = _CODECS[suffix]
+    pictures = (pixels(number, 48, 64) for number in range(5))
+    return encode(folder / f"video{suffix}", pictures, codec, "rgb8" if codec == "gif" else "yuv420p")
 
 
 def _pictures(folder: Path) -> None:
@@ -206,7 +198,7 @@ ROWS = (
     _capture("Polycam", folders.polycam),
     _capture("nerfstudio", folders.nerfstudio),
     _capture("COLMAP", folders.colmap_text),
-    _capture("COLMAP, binary", folders.colmap_binary),
+    _capture("COLMAP, binary", partial(folders.colmap_text, form=".bin")),
     _capture("TUM", folders.tum),
     _data_set("plain", plain_folder),
     _data_set("tum", partial(_tum, frames=4.0)),

@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
-from typing import Any
 from unittest.mock import patch
 
 import numpy as np
 
 from tests.fuzz.cases import Reader
-from tests.fuzz.rows.foreign import file
+from tests.fuzz.rows.foreign import file, made
 from tests.shared.dataset_files import npy
 from tests.shared.room import make_room
 from vggtjax.pipeline.batch.contact import _told as read_card
@@ -27,11 +26,6 @@ from vggtjax.training.metrics import read_metrics
 from vggtjax.training.scenes.dataset import read_index
 
 
-def _archive(folder: Path) -> Path:
-    make_room(3).save_archive(folder / "reconstruction.npz")
-    return folder / "reconstruction.npz"
-
-
 def _read_archive(path: Path) -> None:
     saved_names(path)
     read_card(path)
@@ -41,18 +35,13 @@ def _read_archive(path: Path) -> None:
         assert value is not None
 
 
-def _npz(folder: Path) -> Path:
-    values = {"depth": np.ones((4, 6, 8), np.float32), "mask": np.ones((3, 4), bool), "words": np.array(["a", "b"])}
-    np.savez_compressed(folder / "arrays.npz", allow_pickle=False, **values)
-    return folder / "arrays.npz"
-
-
 def _read_npz(path: Path) -> None:
     arrays.read_headers(path)
     for array in arrays.read_arrays(path).values():
         array.tofile(os.devnull)  # pages of mapped arrays are read
 
 
+_ARRAYS = {"depth": np.ones((4, 6, 8), np.float32), "mask": np.ones((3, 4), bool), "words": np.array(["a", "b"])}
 _WINDOWS = {"model": "tiny", "window": 3}
 
 
@@ -94,22 +83,18 @@ _EVALUATION = {
 _ARCHIVE = 2**26 + 2**23  # slack where an .npz is read: one of any size may declare 64 MiB
 
 
-def _json(name: str, value: Any):
-    return file(name, json.dumps(value))
-
-
 ROWS = (
-    Reader("npz", _npz, _read_npz, _ARCHIVE),
+    Reader("npz", made(lambda path: np.savez_compressed(path, **_ARRAYS), "arrays.npz"), _read_npz, _ARCHIVE),
     Reader("npy", file("array.npy", npy(np.ones((8, 6), np.float32))), arrays.read_array),
-    Reader("result", _archive, _read_archive, _ARCHIVE),
+    Reader("result", made(lambda path: make_room(3).save_archive(path), "reconstruction.npz"), _read_archive, _ARCHIVE),
     Reader("metrics", file("metrics.csv", _METRICS), read_metrics),
-    Reader("index of scenes", _json("index.json", _SCENES), lambda path: read_index(path.parent)),
+    Reader("index of scenes", file("index.json", json.dumps(_SCENES)), lambda path: read_index(path.parent)),
     Reader("stored windows", _windows, _read_windows, _ARCHIVE),
     Reader(
         "settings of a batch",
-        _json(SETTINGS_NAME, _SETTINGS),
+        file(SETTINGS_NAME, json.dumps(_SETTINGS)),
         lambda path: LocalFolder(path.parent).begin(_SETTINGS),
     ),
-    Reader("settings at a URL", _json(SETTINGS_NAME, _SETTINGS), _read_remote_settings),
-    Reader("evaluation", _json("results.json", _EVALUATION), is_report),
+    Reader("settings at a URL", file(SETTINGS_NAME, json.dumps(_SETTINGS)), _read_remote_settings),
+    Reader("evaluation", file("results.json", json.dumps(_EVALUATION)), is_report),
 )

@@ -13,7 +13,7 @@ import numpy as np
 
 from converters.files import read_state_dict
 from tests.fuzz.cases import Reader
-from tests.fuzz.rows.foreign import file
+from tests.fuzz.rows.foreign import file, made
 from tests.shared.dataset_files import write
 from tests.shared.tiny import tiny_config
 from vggtjax.config import VGGTConfig
@@ -80,15 +80,6 @@ def _state() -> Any:
     return TrainingState(jnp.int32(3), {"model": kernel, "probes": probes}, kernel, moments, jnp.int32(0))
 
 
-def _training_checkpoint(folder: Path) -> Path:
-    save(folder / "checkpoints", _state(), read_recipe(_RECIPE), {"seconds": 0.5})
-    return folder / "checkpoints"
-
-
-def _read_training_checkpoint(path: Path) -> None:
-    restore(path, jax.eval_shape(_state), read_recipe(_RECIPE))
-
-
 ROWS = (
     Reader("safetensors", lambda folder: _tensors(folder / "model.safetensors"), _weights),
     Reader("shards with an index", _shards, _weights),
@@ -102,5 +93,9 @@ ROWS = (
     ),
     Reader("recipe", file("recipe.json", _RECIPE.read_bytes()), read_recipe),
     Reader("fusion file", _fusion, load_fusion),
-    Reader("training checkpoint", _training_checkpoint, _read_training_checkpoint),
+    Reader(
+        "training checkpoint",
+        made(lambda path: save(path, _state(), read_recipe(_RECIPE), {"seconds": 0.5}), "checkpoints"),
+        lambda path: restore(path, jax.eval_shape(_state), read_recipe(_RECIPE)),
+    ),
 )

@@ -12,11 +12,12 @@ import torch
 from safetensors.numpy import save_file
 
 from converters.torch_to_flax import source_shapes
+from tests.shared.command import refusal
+from tests.shared.command import run as run_command
 from tests.shared.seeded import seeded_state_dict
 from tests.shared.tiny import tiny_config
 from vggtjax import load_model
 from vggtjax.interface.commands import check_weights as command
-from vggtjax.interface.commands import main as cli
 from vggtjax.research.parity.outputs import OUTPUTS, parities
 from vggtjax.research.parity.own_run import demo_frames, run_own
 
@@ -27,7 +28,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-FOLDER = Path(__file__).parents[3]
+FOLDER = Path(__file__).parents[2]
 Aggregator = AggregatorFor4D = CameraHead = DPTHead = TrackHead = object
 
 class Base(torch.nn.Module):
@@ -109,9 +110,7 @@ def checkout(folder: Path, seeded, **changed: np.ndarray) -> Path:
 
 def run(capsys, seeded, *arguments) -> tuple[int, str, str]:
     words = ["check-weights", *arguments, "--config", seeded[0] / "config.json", "--frames", FRAMES]
-    code = cli.main([str(word) for word in words])
-    captured = capsys.readouterr()
-    return code, captured.out, captured.err
+    return run_command(capsys, *words)
 
 
 def test_beside_code_that_gives_the_same(tmp_path, capsys, seeded):
@@ -154,29 +153,15 @@ def test_alone(capsys, seeded, monkeypatch, tmp_path):
 
 def test_the_table_says_which_file_was_checked_and_its_type(tmp_path, capsys, seeded):
     folder, out = seeded[0], tmp_path / "half.safetensors"
-    converting = [
-        "convert",
-        folder / "tiny.safetensors",
-        out,
-        "--config",
-        folder / "config.json",
-        "--dtype",
-        "bfloat16",
-    ]
-    assert cli.main([*map(str, converting), "--heads", "camera,depth"]) == 0
-    assert cli.main(["check-weights", str(out), "--frames", "1"]) == 0
-    said = capsys.readouterr().out
+    config = ("--config", folder / "config.json", "--dtype", "bfloat16", "--heads", "camera,depth")
+    assert run_command(capsys, "convert", folder / "tiny.safetensors", out, *config)[0] == 0
+    code, said, _ = run_command(capsys, "check-weights", out, "--frames", 1)
+    assert (code, said.count("| yes |")) == (0, 4)
     digest = hashlib.sha256(out.read_bytes()).hexdigest()
     assert f"| SHA-256 of half.safetensors, the file | {digest} |" in said
     assert "| SHA-256 of tiny.safetensors, its source |" in said
     assert "| weights | bfloat16 |" in said
     assert "| heads | camera, depth |" in said
-
-
-def test_a_converted_file_and_the_embedded_model_alone(tiny_demo, capsys, seeded):
-    for name in (tiny_demo, "demo"):
-        assert cli.main(["check-weights", str(name), "--frames", "1"]) == 0
-        assert capsys.readouterr().out.count("| yes |") == 4
 
 
 def test_bad_input(tmp_path, capsys, seeded, monkeypatch, tiny_demo):
@@ -200,8 +185,7 @@ def test_bad_input(tmp_path, capsys, seeded, monkeypatch, tiny_demo):
         code, out, err = run(capsys, seeded, *arguments)
         assert (code, out, words in err) == (2, "", True), err
     assert not (tmp_path / "it-ran").exists()
-    assert cli.main(["check-weights", "demo", "--frames", "17"]) == 2
-    assert "frames is 17; expected at most the 16" in capsys.readouterr().err
+    assert "frames is 17; expected at most the 16" in refusal(capsys, "check-weights", "demo", "--frames", 17)
     (peer / "vggt" / "models" / "vggt.py").write_text("import a_module_that_is_not_there")
     code, _, err = run(capsys, seeded, weights, "--peer", peer)
     assert (code, "No module named 'a_module_that_is_not_there'; install what it needs" in err) == (2, True)

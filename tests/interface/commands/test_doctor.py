@@ -1,7 +1,6 @@
-"""What `vggtjax doctor` prints, and the cache that it clears."""
-
 import json
 import re
+from functools import partial
 
 import jax
 import numpy as np
@@ -20,15 +19,8 @@ from vggtjax.storage.cache import CONVERTED, cache_parts, clear_cache
 def cache(tmp_path, monkeypatch):
     """A cache folder with an entry of every kind, and with files of someone else."""
     monkeypatch.setenv("VGGTJAX_CACHE", str(tmp_path / "cache"))
-    for name in (
-        "compiled/a-cache",
-        "lowered/b.bin",
-        "texts/e.bin",
-        "passes/c.npz",
-        "trials/d.json",
-        f"m-{'0' * 16}.safetensors",
-        "mine.safetensors",
-    ):
+    kinds = "compiled/a-cache lowered/b.bin texts/e.bin passes/c.npz trials/d.json mine.safetensors"
+    for name in (*kinds.split(), f"m-{'0' * 16}.safetensors"):
         path = tmp_path / "cache" / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(b"four")
@@ -77,10 +69,8 @@ def test_the_longest_clip_of_a_gpu_leaves_room_for_the_weights(monkeypatch):
 
     for limit, used in ((4e9, 5e8), (12e9, 1e9)):
         for dtype, clip in longest(limit, used).items():
-            sizes = [
-                memory.predicted_bytes(models[dtype], clip["frames"] + more, clip["height"], clip["width"])
-                for more in (0, 1)
-            ]
+            needed = partial(memory.predicted_bytes, models[dtype], height=clip["height"], width=clip["width"])
+            sizes = [needed(frames=clip["frames"] + more) for more in (0, 1)]
             assert (sizes[0] if clip["frames"] else 0) <= limit - used < sizes[1]
     small, unknown = longest(4e9, 5e8), longest()
     assert small["float32"]["frames"] == 0 < small["bfloat16"]["frames"]
@@ -116,16 +106,8 @@ def test_the_weights_of_a_loaded_model_are_counted_once(monkeypatch):
 def test_the_page_clears_the_cache_of_this_library_alone(cache, capsys):
     assert cli.main(["doctor", "--clear-cache"]) == 0
     page = capsys.readouterr().out
-    for words in (
-        str(cache),
-        "in all",
-        "VGGTJAX_CACHE=FOLDER",
-        "vggtjax doctor --clear-cache",
-        "Longest clip that is run at once",
-        "VGGT-1B, bfloat16",
-        "installed  vggtjax train",
-        "cleared",
-    ):
+    said = "in all; VGGTJAX_CACHE=FOLDER; Longest clip that is run at once; VGGT-1B, bfloat16; installed  vggtjax train"
+    for words in (str(cache), "vggtjax doctor --clear-cache", "cleared", *said.split("; ")):
         assert words in page
     assert [path.name for path in cache.iterdir()] == ["mine.safetensors"]
     assert clear_cache() == 0

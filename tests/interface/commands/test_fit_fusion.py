@@ -1,5 +1,3 @@
-"""The command `vggtjax fit-fusion`, from clips on disk to a file that --fusion takes."""
-
 import dataclasses
 import json
 import shutil

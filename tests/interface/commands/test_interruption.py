@@ -1,10 +1,13 @@
-"""Ctrl-C while the main thread is in compiled code, and while it is in Python: what is kept is said, and it ends."""
+"""The process of a command: Ctrl-C in compiled code and in Python, of which what is kept is said; and its threads."""
 
+import os
 import signal
 import subprocess
 import sys
 
 import pytest
+
+from vggtjax.interface.commands.process import give_devices_threads
 
 _WORK = """
 import hashlib, signal, sys, time
@@ -22,9 +25,7 @@ vggtjax.interface.commands.main.main = work
 sys.exit(run())
 """
 _WORKS = 'print("working", flush=True); '
-_COMPILED = (
-    _WORKS + 'hashlib.pbkdf2_hmac("sha256", b"", b"", 10**9)'
-)  # for minutes, as XLA does; no signal is heard in it
+_COMPILED = _WORKS + 'hashlib.pbkdf2_hmac("sha256", b"", b"", 10**9)'  # for minutes, as XLA; no signal is heard in it
 _PYTHON = _WORKS + "time.sleep(600)"
 _SERVER = """
         try:
@@ -54,3 +55,24 @@ def test_an_interruption_ends_the_process_and_says_what_is_kept(before, work, co
     process.send_signal(signal.SIGINT)
     assert process.communicate(timeout=20)[1] == said
     assert process.returncode == code
+
+
+def test_devices_of_a_split_cpu_have_threads_to_wait_and_to_compute(monkeypatch):
+    flag = "--xla_force_host_platform_device_count"
+    many = str(max(198, os.cpu_count() or 1))
+    for flags, count, given, threads in (
+        (f"--a=1 {flag}=99", "-1", None, many),
+        (f"{flag}=99", "", "3", "3"),
+        (f"{flag}=1", "", None, None),
+        ("", "99", None, many),
+        ("", "-1", None, None),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setenv("XLA_FLAGS", flags)
+            patch.setenv("JAX_NUM_CPU_DEVICES", count)
+            patch.delenv("PJRT_NPROC", raising=False)
+            if given:
+                patch.setenv("PJRT_NPROC", given)
+            give_devices_threads()
+            assert os.environ.get("PJRT_NPROC") == threads
+            os.environ.pop("PJRT_NPROC", None)

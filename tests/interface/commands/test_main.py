@@ -1,5 +1,3 @@
-"""The command line: what it writes, what it says, and its exit codes."""
-
 import json
 import re
 import shutil
@@ -12,6 +10,7 @@ import pytest
 from PIL import Image
 from safetensors.numpy import save_file
 
+from tests.shared.command import refusal, run
 from tests.shared.make_checkpoint import make_checkpoint
 from tests.shared.room import make_room
 from tests.shared.seeded import seeded_state_dict
@@ -28,12 +27,6 @@ pytestmark = [pytest.mark.filterwarnings("ignore:the field of view"), pytest.mar
 @pytest.fixture(scope="module")
 def frames(sequences):
     return sequences / "clip0" / "rgb"
-
-
-def run(capsys, *arguments) -> tuple[int, str, str]:
-    code = cli.main([str(a) for a in arguments])
-    captured = capsys.readouterr()
-    return code, captured.out, captured.err
 
 
 def test_demo(tmp_path, capsys, monkeypatch):
@@ -72,15 +65,14 @@ def test_a_converted_model(tmp_path, capsys, golden):
     assert np.array_equal(np.ravel(token), np.ravel(tensors["aggregator.patch_embed.cls_token"]))
     model.write_bytes(b"another")
     again = ["convert", tmp_path / "torch.safetensors", model, "--config", golden / "config.json"]
-    code, _, err = run(capsys, *again)
-    assert (code, "exists and is not replaced" in err, model.read_bytes()) == (2, True, b"another")
+    assert "exists and is not replaced" in refusal(capsys, *again)
+    assert model.read_bytes() == b"another"
     assert run(capsys, *again, "--overwrite")[0] == 0
     assert load_model(model).config.depth == 24
     source = tmp_path / "torch.safetensors"
     linked, before = tmp_path / "link.safetensors", source.read_bytes()
     linked.hardlink_to(source)
-    code, _, err = run(capsys, "convert", source, linked, "--overwrite")
-    assert (code, "is the source, which is never replaced" in err) == (2, True)
+    assert "is the source, which is never replaced" in refusal(capsys, "convert", source, linked, "--overwrite")
     assert source.read_bytes() == before
 
 
@@ -90,8 +82,8 @@ def test_a_shard_is_a_source_too(tmp_path, capsys, golden):
     shard = tmp_path / "shards" / "model-00002-of-00002.safetensors"
     before = shard.read_bytes()
     config = ["--config", golden / "config.json", "--overwrite"]
-    code, _, err = run(capsys, "convert", tmp_path / "shards", shard, *config)
-    assert (code, "is the source" in err, shard.read_bytes() == before) == (2, True, True)
+    assert "is the source" in refusal(capsys, "convert", tmp_path / "shards", shard, *config)
+    assert shard.read_bytes() == before
 
 
 def test_a_source_or_a_strangers_file_in_the_output_folder_is_not_replaced(tmp_path, capsys, tiny_demo, sequences):
@@ -100,8 +92,8 @@ def test_a_source_or_a_strangers_file_in_the_output_folder_is_not_replaced(tmp_p
     film = result / "preview" / "turntable.webp"
     shutil.copy(next((sequences / "clip0" / "rgb").iterdir()), film.with_suffix(".png"))
     before = sorted(result.rglob("*"))
-    code, _, err = run(capsys, "reconstruct", film.with_suffix(".png"), "--model", "demo", "--out", result)
-    assert (code, "is part of the result in" in err) == (2, True)
+    words = ("reconstruct", film.with_suffix(".png"), "--model", "demo", "--out", result)
+    assert "is part of the result in" in refusal(capsys, *words)
     assert sorted(result.rglob("*")) == before
     run_folder = tmp_path / "run"
     run_folder.mkdir()
@@ -115,8 +107,7 @@ def test_a_source_or_a_strangers_file_in_the_output_folder_is_not_replaced(tmp_p
         (("calibrate-cues", "--model", model, "--out", run_folder), "is the source"),
         (("calibrate-cues", "--model", run_folder, "--out", run_folder), "is the source"),
     ):
-        code, _, err = run(capsys, *arguments)
-        assert (code, words in err) == (2, True), err
+        assert words in refusal(capsys, *arguments)
         assert model.read_bytes() == tiny_demo.read_bytes()
 
 
@@ -145,9 +136,7 @@ def test_reconstruct_with_masks_and_tracks_of_ones_own(tmp_path, capsys, frames)
         assert np.array_equal(np.asarray(shown), np.asarray(picture))
 
     arguments = ("import", tmp_path / "out/vggt4d", "--format", "vggt4d", "--out", tmp_path / "again")
-    code, _, err = run(capsys, *arguments)
-    assert code == 2
-    assert "does not say the order of its quaternions" in err
+    assert "does not say the order of its quaternions" in refusal(capsys, *arguments)
     code, _, err = run(capsys, *arguments, "--quaternion", "wxyz")
     assert code == 0, err
     again = Reconstruction.load(tmp_path / "again")
@@ -169,21 +158,13 @@ def test_reconstruct_with_masks_and_tracks_of_ones_own(tmp_path, capsys, frames)
         (["reconstruct", "{frames}", "--out", "{tmp}/out", "--masks", "{tmp}/none"], "none"),
         (["reconstruct", "{tmp}/nothing", "--out", "{tmp}/out"], "does not exist"),
         (["reconstruct", "{frames}", "--out", "{tmp}/out"], "no model is named"),
-        (["reconstruct", "{tmp}/a.mp4", "--out", "{tmp}/out"], "cannot read video"),
         (["convert", "demo", "{tmp}/out.safetensors"], "demo is the embedded model, which needs no conversion"),
         (["convert", "{frames}/00000.png", "{tmp}/out.safetensors", "--heads", "camera,nose"], "heads has ['nose']"),
-        (["info", "{tmp}/a.mp4"], "a.mp4"),
     ],
 )
 def test_bad_input_is_one_sentence_and_exit_code_2(tmp_path, capsys, frames, arguments, sentence):
     places = {"tmp": tmp_path, "frames": frames}
-    (tmp_path / "a.mp4").write_text("no video")
-    code, _, err = run(capsys, *(a.format(**places) for a in arguments))
-    assert code == 2
-    last = err.strip().splitlines()[-1]
-    assert last.startswith("vggtjax: ")
-    assert sentence in last
-    assert err.count("vggtjax: ") == 1
+    assert sentence in refusal(capsys, *(a.format(**places) for a in arguments))
     assert not (tmp_path / "out").exists() or not any((tmp_path / "out").iterdir())
     assert not (tmp_path / "out.safetensors").exists()
 
@@ -191,10 +172,8 @@ def test_bad_input_is_one_sentence_and_exit_code_2(tmp_path, capsys, frames, arg
 def test_a_reader_that_ends_early_is_no_error():
     command = [sys.executable, "-m", "vggtjax", "--version"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
-        assert process.stdout is not None
-        assert process.stderr is not None
-        process.stdout.close()
-        assert process.stderr.read() == b""
+        process.stdout.close()  # type: ignore[union-attr]
+        assert process.stderr.read() == b""  # type: ignore[union-attr]
     assert process.returncode == 1
 
 
@@ -219,13 +198,11 @@ def test_interruption_while_modules_are_imported(monkeypatch, capsys):
 
 
 def test_a_mistyped_command_or_flag_names_the_one_that_was_meant(capsys):
-    code, _, err = run(capsys, "recontsruct", "clip.mp4")
-    assert code == 2
-    assert err == ("vggtjax: there is no command 'recontsruct'; did you mean reconstruct? vggtjax --help lists all\n")
+    said = refusal(capsys, "recontsruct", "clip.mp4")
+    assert said == "vggtjax: there is no command 'recontsruct'; did you mean reconstruct? vggtjax --help lists all"
     assert "did you mean" not in run(capsys, "zzzz")[2]
     for gone in (("export-model", "demo", "--out", "x"), ("export_model",), ("view", "x", "--format=viser")):
-        code, _, err = run(capsys, *gone)
-        assert (code, "is no longer there: " in err) == (2, True)
+        assert "is no longer there: " in refusal(capsys, *gone)
     with pytest.raises(SystemExit) as stop:
         run(capsys, "reconstruct", "clip.mp4", "--out", "x", "--max-frame", "8")
     assert stop.value.code == 2

@@ -117,11 +117,8 @@ def test_a_run_without_memory_is_run_once_more_in_windows(video, in_windows, tmp
 
 def test_clips_of_a_batch_that_do_not_fit_are_run_in_windows(video, in_windows, tmp_path, monkeypatch):
     def outcome(out, **changes):
-        saving, options = Saving(only=("cameras",)), Options(method="vggt")
-        found = reconstruct_many(
-            load_model("demo"), {"a": video}, tmp_path / out, options=options, saving=saving, **changes
-        )
-        (only,) = found
+        saved = {"options": Options(method="vggt"), "saving": Saving(only=("cameras",))}
+        (only,) = reconstruct_many(load_model("demo"), {"a": video}, tmp_path / out, **saved, **changes)
         if only.status == "done":
             assert np.array_equal(Reconstruction.load(tmp_path / out / "a").depth.shape, in_windows.depth.shape)
             assert not (tmp_path / out / "a" / FOLDER).exists()

@@ -1,8 +1,9 @@
-"""What a command prints: names of files forge no line of the terminal and send it no control characters."""
+"""What a command prints: its help, and names of files that forge no line and send no control characters."""
 
 import errno
 import logging
 import os
+import re
 import subprocess
 import sys
 import warnings
@@ -68,3 +69,21 @@ def test_output_in_a_code_page_without_the_letters_of_a_folder(tmp_path, code):
     assert folder.name.encode(code, "replace") in told.stdout
     missing = run([sys.executable, "-m", "vggtjax", "info", f"{folder}-нет"])
     assert (missing.returncode, b"Traceback" in missing.stderr) == (2, False)
+
+
+@pytest.mark.parametrize("width", [80, 120])
+@pytest.mark.parametrize("name", cli.COMMANDS)
+def test_every_option_shows_its_values_and_what_it_does(name, width, capfd, monkeypatch):
+    """Of capsys, whose encoding is called UTF-8 and not utf-8, tyro expects no boxes."""
+    monkeypatch.setenv("COLUMNS", str(width))
+    for flag in ("--help", "-h"):
+        assert cli.main([name, flag]) == 0
+    page = capfd.readouterr().out
+    boxed = [line for line in page.splitlines() if line.startswith(("╭", "│"))]  # paragraphs are left to the terminal
+    assert max(map(len, boxed)) <= width
+    assert f"usage: vggtjax {name} " in page
+    assert not re.search(r"--\S+ STR\b", page)
+    options = [option.split("╰")[0] for option in re.split(r"^│ (?=-)", page, flags=re.MULTILINE)[1:]]
+    assert len(options) > 1
+    for option in options:  # its text stands behind spaces, beside the flag or below a long one
+        assert re.search(r"\S {2,}[^│\s]", option), option

@@ -49,9 +49,8 @@ def test_fewer_steps_from_a_model_and_a_run_that_goes_on(recipe, tmp_path, capsy
     model = read_model(out / "model.safetensors")
     assert model.dtype == "bfloat16"
     assert (model.note, model.untrained_heads) == ("first attempt", ("camera", "points"))
-    np.testing.assert_allclose(
-        np.asarray(model.params["backbone"]["class_token"], np.float32), params["backbone"]["class_token"], rtol=0.01
-    )
+    token, own = (np.asarray(tree["backbone"]["class_token"], np.float32) for tree in (model.params, params))
+    np.testing.assert_allclose(token, own, rtol=0.01)
     assert json.loads((out / "recipe.json").read_text())["stages"][0]["steps"] == 2
     command.train(recipe, out, steps=3, options=RunOptions(log_every=2, dtype="bfloat16"))  # without --init: resumed
     said = capsys.readouterr().out
@@ -66,6 +65,7 @@ def test_bad_input(recipe, tmp_path, monkeypatch):
     for values, says in (
         ({"seconds": 0.0}, "seconds is 0.0"),
         ({"log_every": 0}, "log_every is 0"),
+        ({"dtype": "float16"}, "dtype is 'float16'"),
     ):
         with pytest.raises(InputError, match=says):
             RunOptions(**values)  # type: ignore[arg-type]

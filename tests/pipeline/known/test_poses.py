@@ -1,15 +1,15 @@
-"""Known poses: their files, and a result that takes them."""
+"""Known poses: their files, a result that takes them, and the depth and focal length that agree with them."""
 
 import numpy as np
 import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from tests.shared.room import make_room
-from tests.shared.textured_room import textured_room
+from tests.shared.room import make_room, textured_room
 from vggtjax import load_clip
 from vggtjax.errors import InputError
 from vggtjax.pipeline.known.apply import apply_known
+from vggtjax.pipeline.known.consistency import consistent_with_poses
 from vggtjax.pipeline.known.given import check_readable, read_known
 from vggtjax.pipeline.known.options import KnownGeometry
 from vggtjax.pipeline.known.poses import read_poses
@@ -90,11 +90,7 @@ PLACE, ROTATION, REPLICATED = np.s_[:, :3, 3], np.s_[:, :3, :3], np.s_[:]
     [
         (ROTATION, lambda turns: 1.1 * turns, "the camera pose of frame 0 is not a rotation"),
         (PLACE, lambda places: 0 * places + [3, 2, 1], r"the 6 poses of .* are at one place, \[3.0, 2.0, 1.0\]"),
-        (
-            PLACE,
-            lambda places: np.add(places, [50_000, 58_000, 30]),
-            r"at about \[5000\d.0, .*, too far from",
-        ),
+        (PLACE, lambda places: np.add(places, [50_000, 58_000, 30]), r"at about \[5000\d.0, .*, too far from"),
         (ROTATION, lambda turns: TURNING @ turns, r"differ from the predicted ones by \d+ degrees"),
         (ROTATION, lambda turns: turns * [1, -1, -1], "by 14 degrees .* 0.0 degrees and 0% if read in OpenGL's axes"),
         (REPLICATED, np.linalg.inv, r"by \d+ degrees .* 0.0 degrees and 0% if read as camera-from-world"),
@@ -144,9 +140,8 @@ def test_the_names_of_the_columns_tell_the_order(tmp_path, header, order, mark, 
 def test_matrices_row_by_row(tmp_path, width, mark):
     poses = ROOM.world_from_camera
     rows = (poses[:, :3] if width == 12 else poses).reshape(-1, width)
-    (tmp_path / "p.txt").write_text(
-        mark + "\n".join(" ".join(map(repr, row)) for row in rows.tolist()), encoding="utf-8"
-    )
+    lines = [" ".join(map(repr, row)) for row in rows.tolist()]
+    (tmp_path / "p.txt").write_text(mark + "\n".join(lines), encoding="utf-8")
     np.testing.assert_allclose(read_poses(tmp_path / "p.txt", ROOM), poses, atol=1e-6)
     with pytest.raises(InputError, match="has matrices; leave --quaternion out"):
         read_poses(tmp_path / "p.txt", ROOM, "wxyz")
@@ -156,12 +151,8 @@ def test_matrices_row_by_row(tmp_path, width, mark):
 def test_quaternions_in_another_order_are_named(tmp_path, written, read):
     path = tmp_path / "poses.txt"
     path.write_text("\n".join(_lines(ROOM.world_from_camera, written)))
-    right = read_known(KnownGeometry(poses=str(path), quaternion=written), ROOM).poses
-    assert right is not None
-    np.testing.assert_allclose(right, ROOM.world_from_camera, atol=1e-6)
-    message = (
-        rf"\d+ degrees .* and by 0\.\d degrees and 0% if read with the quaternion's w .* \(--quaternion {written}\)"
-    )
+    np.testing.assert_allclose(read_poses(path, ROOM, written), ROOM.world_from_camera, atol=1e-6)
+    message = rf"by 0\.\d degrees and 0% if read with the quaternion's w .* \(--quaternion {written}\)"
     with pytest.raises(InputError, match=message):
         apply_known(ROOM, read_known(KnownGeometry(poses=str(path), quaternion=read), ROOM))
 
@@ -171,11 +162,7 @@ def test_files_of_programs_with_w_first_need_the_order(tmp_path):
     path.write_text("\n".join(_lines(ROOM.world_from_camera, "wxyz")))
     with pytest.raises(InputError, match="does not say the order of its quaternions; give --quaternion wxyz"):
         check_readable(KnownGeometry(poses=str(path)))
-    known = KnownGeometry(poses=str(path), quaternion="wxyz")
-    check_readable(known)
-    found = read_known(known, ROOM).poses
-    assert found is not None
-    np.testing.assert_allclose(found, ROOM.world_from_camera, atol=1e-6)
+    check_readable(KnownGeometry(poses=str(path), quaternion="wxyz"))
     with pytest.raises(InputError, match="is of a file of poses; give the file with --poses"):
         KnownGeometry(quaternion="wxyz")
 
@@ -193,3 +180,31 @@ def test_files_that_are_no_poses(tmp_path, text, message):
     (tmp_path / "p.txt").write_text(text)
     with pytest.raises(InputError, match=message):
         read_poses(tmp_path / "p.txt", ROOM)
+
+
+TEXTURED = textured_room(4)
+STATIC = ~TEXTURED.dynamic_mask
+
+
+def test_what_is_right_stays_as_it_is():
+    broken = np.where(TEXTURED.dynamic_mask, np.float32(30), TEXTURED.depth)  # movers do not count
+    made = consistent_with_poses(textured_room(4, depth=broken), focal_known=False)
+    assert made.focal == 1
+    np.testing.assert_array_equal(made.depth[STATIC], 1)
+
+
+def test_one_scale_and_a_smooth_distortion_are_undone():
+    across = np.linspace(-1, 1, 84)
+    distorted = textured_room(4, depth=TEXTURED.depth * 1.5 * np.exp(0.35 * across).astype(np.float32))
+    made = consistent_with_poses(distorted, focal_known=True)
+    left = np.abs(made.depth * distorted.depth / TEXTURED.depth - 1)[STATIC]
+    assert left.mean() < 0.05
+    assert made.cost[1] < made.cost[0]
+
+
+@pytest.mark.proof
+def test_a_wrong_focal_length_is_found():
+    wrong = textured_room().intrinsics.copy()
+    wrong[:, [0, 1], [0, 1]] *= 1.2
+    made = consistent_with_poses(textured_room(intrinsics=wrong), focal_known=False)
+    assert made.focal == pytest.approx(1 / 1.2, rel=0.04)

@@ -1,5 +1,3 @@
-"""What the package embeds: a trained model and a clip with exact truth."""
-
 import hashlib
 import re
 from pathlib import Path

@@ -1,11 +1,6 @@
-"""The field of log scale: against a slow reference, and with wrong measurements."""
-
 import numpy as np
-import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from vggtjax.pipeline.refinement.field import FieldPrior, Measured, at_pixels, fit_field, grid_shape
+from vggtjax.pipeline.refinement.field import FieldPrior, Measured, at_pixels, fit_field
 
 
 def measured(function, count, frame=0, seed=0, precision=400.0):
@@ -27,11 +22,9 @@ def test_a_smooth_field_is_found_and_frames_without_measurements_have_none():
 def test_it_solves_the_normal_equations_of_dense_matrices():
     prior = FieldPrior(step=0.1, offset=0.2, robust=1e6, together=1e6, nodes=4)
     found = measured(lambda x, y: x - y**2, 50)
-    places = [
-        [max(0.0, 1 - abs(v * 3 - i)) * max(0.0, 1 - abs(u * 3 - j)) for i in range(4) for j in range(4)]
-        for u, v in found.place
-    ]
-    A, number = np.array(places), np.arange(16).reshape(4, 4)
+    weights = np.maximum(0, 1 - np.abs(3 * found.place[..., None] - np.arange(4)))  # [N, 2, 4], of u and v
+    A = np.einsum("nj,ni->nij", *weights.transpose(1, 0, 2)).reshape(-1, 16)
+    number = np.arange(16).reshape(4, 4)
     H = np.eye(16) / prior.offset**2
     edges = [(number[1:], number[:-1]), (number[:, 1:], number[:, :-1])]
     for a, b in [pair for each in edges for pair in zip(each[0].ravel(), each[1].ravel(), strict=True)]:
@@ -47,16 +40,3 @@ def test_a_quarter_of_wrong_measurements_hardly_moves_it():
     mixed = right._replace(log_ratio=np.where(wrong, 1.5, right.log_ratio))
     fields = fit_field(mixed, 1, (20, 20), FieldPrior(robust=0.1))
     assert np.abs(fields - 0.1).max() < 0.03
-
-
-@given(st.integers(1, 2000), st.integers(1, 2000), st.integers(2, 20))
-def test_grids_have_square_cells_and_at_least_two_nodes_a_side(height, width, nodes):
-    rows, columns = grid_shape((height, width), nodes)
-    assert max(rows, columns) == nodes
-    assert min(rows, columns) >= 2
-
-
-@pytest.mark.parametrize("error", [0.03, 0.3])
-def test_priors_follow_the_error_of_the_depth(error):
-    prior = FieldPrior.of_error(error)
-    assert (prior.step, prior.offset) == (1.5 * error, 3 * error)

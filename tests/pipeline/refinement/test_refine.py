@@ -9,6 +9,8 @@ pytest.importorskip("pycolmap", reason="needs the extra colmap")
 
 from tests.shared.corner import FOCAL, HEIGHT, SCALE, WIDTH, corner_result, exact_tracks, make_corner, paint
 from vggtjax.cameras import world_from_camera
+from vggtjax.options import Options
+from vggtjax.pipeline.agreement import agree_with_pixels
 from vggtjax.pipeline.refinement.matches import frame_pairs
 from vggtjax.pipeline.refinement.refine import adjust_to_tracks, refine_cameras
 from vggtjax.pipeline.refinement.tracks import join_matches
@@ -34,10 +36,8 @@ def test_cameras_converge_to_the_truth(wrong):
     assert report.error_after == pytest.approx(0, abs=0.01)
     np.testing.assert_array_equal(refined.camera_from_world[0], result.camera_from_world[0])
     np.testing.assert_array_equal(refined.depth, result.depth)
-    steps = [
-        np.linalg.norm(np.diff(each.camera_centres, axis=0), axis=1)
-        for each in (refined, corner_result(corner, degrees=0, share=0))
-    ]
+    true = corner_result(corner, degrees=0, share=0)
+    steps = [np.linalg.norm(np.diff(each.camera_centres, axis=0), axis=1) for each in (refined, true)]
     np.testing.assert_allclose(*steps, rtol=0.01)  # the scale of the depth
 
 
@@ -54,11 +54,8 @@ def test_pictures_refine_cameras_and_what_moves_has_no_vote():
         left = (4 + 17 * frame) // SCALE
         mask[frame, 50 // SCALE : 41, left : left + 33] = True
     steps = []
-    masked, report = refine_cameras(
-        dataclasses.replace(result, dynamic_mask=mask),
-        pictures,
-        progress=lambda done, total: steps.append((done, total)),
-    )
+    known = dataclasses.replace(result, dynamic_mask=mask)
+    masked, report = refine_cameras(known, pictures, progress=lambda done, total: steps.append((done, total)))
     unmasked, _ = refine_cameras(result, pictures)
     before, with_mask, without = (camera_errors(each, corner) for each in (result, masked, unmasked))
     assert report.refined
@@ -110,13 +107,21 @@ def test_pairs_and_tracks_by_hand():
     assert {frame for pair in far for frame in pair} == set(range(100))
     # Feature 0 of three frames is one point; frame 2 has two places for the point of feature 1, and loses it.
     places = [np.arange(6.0).reshape(3, 2) + 10 * frame for frame in range(3)]
-    matches = {
-        (0, 1): np.array([[0, 0], [1, 1]]),
-        (1, 2): np.array([[0, 0], [1, 1]]),
-        (0, 2): np.array([[1, 2]]),
-    }
+    same = np.array([[0, 0], [1, 1]])
+    matches = {(0, 1): same, (1, 2): same, (0, 2): np.array([[1, 2]])}
     tracks = join_matches(places, matches, 2)
     assert tracks.points.tolist() == [0, 1, 0, 1, 0]
     assert tracks.frames.tolist() == [0, 0, 1, 1, 2]
     assert tracks.positions[-1].tolist() == [20, 21]
     assert join_matches(places, matches, 3).number == 1
+
+
+def test_refined_points_are_fitted_by_consistent_depth_too():
+    corner = make_corner(4, 0.7)
+    pictures, predicted = paint(corner), corner_result(corner, degrees=2)
+    options = Options(refine_cameras=True, consistent_depth=True)
+    made = agree_with_pixels(predicted, lambda: iter(pictures), options)
+    assert made.settings["consistency"]["points"] > 100
+    assert list(made.known_facts) == ["cameras", "depth"]
+    before, after = (rotation_error(each.camera_from_world, corner.camera_from_world) for each in (predicted, made))
+    assert after < 0.1 * before

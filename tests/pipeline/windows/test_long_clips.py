@@ -10,17 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.pipeline.windows.walk import (
-    CONFIG,
-    FRAMES,
-    SETTINGS,
-    movers,
-    plan_of,
-    tools_of,
-    walk,
-    window_result,
-    windows_of,
-)
+from tests.pipeline.windows import walk as walks
+from tests.pipeline.windows.walk import CONFIG, FRAMES, movers, walk, window_result
+from tests.shared.contents import contents
 from vggtjax.errors import ClipError, InputError, OutputError
 from vggtjax.pipeline.windows.run import run_windows
 from vggtjax.pipeline.windows.store import FOLDER
@@ -37,7 +29,8 @@ def exact(clip) -> Reconstruction:
 
 def reconstructed(out, run, *, loops=False, masks=True, source=None) -> Reconstruction:
     images = np.asarray(walk().images) if source is None else source
-    return run_windows(images, out, windows_of(loops=loops), plan_of(masks=masks), tools_of(run), SETTINGS)
+    cut, plan = walks.windows_of(loops=loops), walks.plan_of(masks=masks)
+    return run_windows(images, out, cut, plan, walks.tools_of(run), walks.SETTINGS)
 
 
 def path_error(result) -> float:
@@ -122,25 +115,17 @@ def test_a_killed_run_goes_on_and_ends_with_the_same_bytes(tmp_path):
     every, calls = calls, []
     assert len(every) > 5  # five windows, and those of loops
     np.savez(tmp_path / "walk.npz", **walk()._asdict())
-    words = [
-        sys.executable,
-        "-m",
-        "tests.pipeline.windows.killed",
-        tmp_path / "killed",
-        tmp_path / "walk.npz",
-        "write",
-        30,
-    ]
-    killed = subprocess.run([*map(str, words)], cwd=Path(__file__).parents[3], check=False)
+    files = [str(tmp_path / name) for name in ("killed", "walk.npz")]
+    words = [sys.executable, "-m", "tests.pipeline.windows.killed", *files, "write", "30"]
+    killed = subprocess.run(words, cwd=Path(__file__).parents[3], check=False)
     assert killed.returncode == -signal.SIGKILL  # while files of frames are written
     assert not (tmp_path / "killed" / "reconstruction.npz").exists()
     assert len(list((tmp_path / "killed").rglob("[0-9]*.npz"))) == 5
     reconstructed(tmp_path / "killed", run, loops=True)
     assert calls == []  # nothing is computed twice
-    files = sorted(path.relative_to(tmp_path / "whole") for path in (tmp_path / "whole").rglob("*") if path.is_file())
-    there = sorted(path.relative_to(tmp_path / "killed") for path in (tmp_path / "killed").rglob("*") if path.is_file())
-    assert there == files  # and the folder of the windows is gone
-    assert all((tmp_path / "whole" / name).read_bytes() == (tmp_path / "killed" / name).read_bytes() for name in files)
+    whole, again = contents(tmp_path / "whole"), contents(tmp_path / "killed")
+    assert again.keys() == whole.keys()  # and the folder of the windows is gone
+    assert again == whole
 
 
 def test_stored_windows_of_other_frames_are_not_used(tmp_path, caplog):

@@ -1,11 +1,11 @@
-"""All windows solved together: chains are exact, loops take their drift back, a wrong loop is outvoted."""
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from vggtjax.errors import InputError
 from vggtjax.pipeline.windows.graph import Edge, solve_graph
+from vggtjax.pipeline.windows.loops import described_frames, find_loops, frames_around
+from vggtjax.pipeline.windows.plan import plan_windows
 from vggtjax.similarity import Similarity
 
 
@@ -67,3 +67,34 @@ def test_a_wrong_loop_does_not_bend_everything():
 def test_a_window_without_an_edge():
     with pytest.raises(InputError, match="window 2 is joined to no other"):
         solve_graph(3, edges_of(ring(3), [(0, 1)]), [1.0] * 3)
+
+
+WINDOWS = plan_windows(80, 8, 2)
+
+
+def features_of(angle):
+    """Return features of each window's described frames, of a camera that turns by `angle` of the frame's number."""
+    places = [np.array([angle(frame) for frame in described_frames(window)]) for window in WINDOWS]
+    return [np.stack([np.cos(place), np.sin(place), np.full(len(place), 5.0)], axis=1) for place in places]
+
+
+def test_a_camera_that_comes_back_is_found_where_it_does():
+    found = find_loops(features_of(lambda frame: 2 * np.pi * frame / 72), WINDOWS, most=10)
+    assert found
+    for loop in found:
+        assert 60 <= loop.second_frame - loop.first_frame <= 80  # once around
+        assert loop.first_frame in WINDOWS[loop.first]
+        assert loop.second_frame in WINDOWS[loop.second]
+
+
+def test_a_camera_that_goes_on_closes_no_loop():
+    assert find_loops(features_of(lambda frame: 1.2 * np.pi * frame / 80), WINDOWS, most=10) == []
+    assert frames_around(19, range(10, 20), 4) == range(16, 20)  # frames around a loop's stay in its window
+
+
+def test_no_more_than_asked_for_and_each_place_once():
+    around = features_of(lambda frame: 2 * np.pi * frame / 20)
+    found = find_loops(around, WINDOWS, most=100)
+    assert find_loops(around, WINDOWS, most=2) == found[:2]
+    pairs = [(loop.first, loop.second) for loop in found]
+    assert all(max(abs(a - c), abs(b - d)) > 2 for i, (a, b) in enumerate(pairs) for c, d in pairs[:i])

@@ -19,22 +19,11 @@ from vggtjax.interface.commands.calibrate_cues import calibrate_cues
 from vggtjax.method.cues import GramCues
 from vggtjax.method.passes import motion_saliency
 from vggtjax.network.checkpoint import Model, save_model
+from vggtjax.research.calibration import sweep as sweeps
 from vggtjax.research.calibration.choice import candidates, choose, halves
 from vggtjax.research.calibration.export import MODEL, NUMBERS, PICTURE, check_folder, save_calibration
 from vggtjax.research.calibration.matching import CameBack, matching_pairs
-from vggtjax.research.calibration.sweep import (
-    DYNAMIC,
-    GRAMS,
-    KINDS,
-    STATIC,
-    UNCLEAR,
-    Sweep,
-    SweepCues,
-    kind_index,
-    sweep,
-    token_auc,
-    token_truth,
-)
+from vggtjax.research.calibration.sweep import DYNAMIC, GRAMS, KINDS, STATIC, Sweep, SweepCues, sweep, token_auc
 
 FRAMES, SIZE, CLIPS = 4, 56, 4
 
@@ -48,13 +37,8 @@ class Moving(NamedTuple):
 
 @pytest.fixture(scope="module")
 def model():
-    config = tiny_config(
-        camera_depth=4,
-        camera_num_heads=4,
-        track_features=16,
-        track_hidden=48,
-        motion=MotionConfig(offsets=(-2, -1, 1, 2), floor=0.3),
-    )
+    motion = MotionConfig(offsets=(-2, -1, 1, 2), floor=0.3)
+    config = tiny_config(camera_depth=4, camera_num_heads=4, track_features=16, track_hidden=48, motion=motion)
     return Model(config, init_params(0, config), "tiny", note="first attempt", untrained_heads=("tracks",))
 
 
@@ -84,10 +68,6 @@ def make_sweep(seed, truth, depth=3):
     maps = np.random.default_rng(seed).normal(size=(len(GRAMS), len(KINDS), depth, *truth.shape)).astype(np.float32)
     saliency = np.random.default_rng(seed).random((2, *truth.shape), np.float32)
     return Sweep(maps, truth, MotionConfig(), saliency, np.zeros((depth, len(truth)), np.float32))
-
-
-def random_truth(seed, shape=(4, 3, 20)):
-    return np.random.default_rng(seed).choice([STATIC, DYNAMIC, UNCLEAR], shape, p=(0.6, 0.3, 0.1)).astype(np.int8)
 
 
 @partial(jax.jit, static_argnames="cues")
@@ -122,9 +102,9 @@ def test_maps_and_table_are_those_of_the_cues(queries_and_keys, gram):
 
 
 def test_a_cue_that_the_sweep_does_not_measure_is_named():
-    assert [kind_index(kind) for kind in KINDS] == list(range(len(KINDS)))
+    assert [sweeps.kind_index(kind) for kind in KINDS] == list(range(len(KINDS)))
     with pytest.raises(InputError, match="cue 'other' is the mean of k with q; the sweep has only qq_mean, qq_std"):
-        kind_index(Cue("other", "k", "q", (0,), "mean"))
+        sweeps.kind_index(Cue("other", "k", "q", (0,), "mean"))
 
 
 def test_pairs_match_whose_matches_come_back(queries_and_keys):
@@ -144,22 +124,22 @@ def test_truth_of_tokens_by_hand():
     mask[0, :2, :2] = True  # all four pixels
     mask[0, 0, 2:4] = True  # two of four
     mask[0, 2, 0] = True  # one of four
-    assert token_truth(mask, 2).tolist() == [[DYNAMIC, DYNAMIC, STATIC, UNCLEAR, STATIC, STATIC]]
+    assert sweeps.token_truth(mask, 2).tolist() == [[DYNAMIC, DYNAMIC, STATIC, sweeps.UNCLEAR, STATIC, STATIC]]
 
 
 def test_unclear_tokens_do_not_count():
-    truth = np.array([[[DYNAMIC, STATIC, STATIC, UNCLEAR]]], np.int8)
+    truth = np.array([[[DYNAMIC, STATIC, STATIC, sweeps.UNCLEAR]]], np.int8)
     assert token_auc(np.array([[[0.5, 0.1, 0.9, 1.0]]]), truth) == 0.5
 
 
 def test_a_planted_map_is_chosen_first():
-    truth = random_truth(0)
+    kinds, generator = [STATIC, DYNAMIC, sweeps.UNCLEAR], np.random.default_rng(0)
+    truth = generator.choice(kinds, (4, 3, 20), p=(0.6, 0.3, 0.1)).astype(np.int8)
     planted = make_sweep(1, truth)
     planted.maps[0, 3, 1] = -1 * (truth == DYNAMIC)  # of similarity "cosine" only
     chosen = choose(planted)
     assert chosen.motion.cues == (Cue("layer1_kk_std", "k", "k", (1,), "std", inverted=True),)
-    assert chosen.steps[0].rating == (1, 1)
-    assert chosen.motion.reference_depth == 3
+    assert (chosen.steps[0].rating, chosen.motion.reference_depth) == ((1, 1), 3)
     assert choose(planted, gram="dot").motion.cues[0].name != "layer1_kk_std"
 
 
@@ -201,11 +181,9 @@ def test_a_calibrated_model_knows_its_table(tmp_path, model, swept, choice):
     assert len(numbers["choice"]["steps"]) == len(choice.steps)
     assert MotionConfig(**numbers["choice"]["motion"]) == choice.motion
     assert np.allclose([row["auc_of_layers"] for row in numbers["sweep"]], swept.auc().reshape(-1, 4), atol=1e-6)
-    clips = numbers["clips"]
-    assert clips["calibration"]["clips"] + clips["held_out"]["clips"] == CLIPS
-    assert sum(v for half in ("calibration", "held_out") for k, v in clips[half].items() if k.endswith("tokens")) == (
-        swept.truth.size
-    )
+    halves = [numbers["clips"][half] for half in ("calibration", "held_out")]
+    assert sum(half["clips"] for half in halves) == CLIPS
+    assert sum(v for half in halves for k, v in half.items() if k.endswith("tokens")) == swept.truth.size
     with Image.open(tmp_path / "out" / PICTURE) as picture:
         assert picture.width > 600
     save_calibration(tmp_path / "out", loaded, swept, choice)  # replaces the earlier one
@@ -239,8 +217,7 @@ def test_the_command(tmp_path, model, clips, capsys, monkeypatch):
     assert wanted == [(CLIPS, FRAMES, SIZE, 5)]
     loaded = load_model(tmp_path / "out" / MODEL)
     assert 1 <= len(loaded.config.motion.cues) <= 2
-    assert loaded.config.motion.reference_depth == 4
-    assert loaded.config.motion.floor == 0.2
+    assert (loaded.config.motion.reference_depth, loaded.config.motion.floor) == (4, 0.2)
     printed = capsys.readouterr()
     assert loaded.config.motion.cues[0].name in printed.out
     assert "default table" in printed.out

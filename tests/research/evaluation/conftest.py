@@ -1,5 +1,3 @@
-"""What tests of evaluations share."""
-
 import dataclasses
 
 import numpy as np

@@ -1,15 +1,23 @@
-"""Where other projects' frames lie in the pictures they came from."""
+"""Sources of results, and where other projects' frames lie in the pictures they came from."""
 
 import dataclasses
+from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
-from tests.results.foreign_writers import ROOM, WRITERS
 from tests.shared.room import make_room
-from vggtjax import Reconstruction, load_clip
+from tests.shared.tiny import tiny_model
+from vggtjax import load_clip
 from vggtjax.errors import InputError
+from vggtjax.method.assembly import check_fuses
+from vggtjax.method.fusion.family import paper_rule
+from vggtjax.network.checkpoint import read_model, save_model
+from vggtjax.progress import no_stage
+from vggtjax.research.evaluation.datasets.sequence import LabelledSequence
 from vggtjax.research.evaluation.foreign_frames import placed
+from vggtjax.research.evaluation.sources import FolderSource, ModelSource
 
 
 def of_size(width, height, frames=2):
@@ -106,21 +114,6 @@ def test_frames_of_others_are_the_sequences_by_number_or_time_or_not_at_all():
     assert found(numbered(0, 1, times=np.array([1700000001.0, 1700000003.0])), named) == {named[1]: 0, named[3]: 1}
 
 
-@pytest.mark.parametrize("lost", [0, 2])
-def test_a_folder_with_a_lost_frame_is_placed_as_it_was_written(tmp_path, lost):
-    tmp_path = tmp_path / "result"
-    WRITERS["monst3r"](tmp_path)
-    lines = (tmp_path / "pred_traj.txt").read_text().splitlines()
-    lines[lost] = f"{lost} " + "nan " * 7
-    (tmp_path / "pred_traj.txt").write_text("\n".join(lines))
-    result = Reconstruction.load(tmp_path, format="monst3r", quaternion="wxyz")
-    names = ["frame_0001", "frame_0002", "frame_0003"]
-    made = placed(result, "monst3r", [(42, 28)] * 3, names)
-    left = [frame for frame in range(3) if frame != lost]
-    assert made.frame_names == tuple(names[frame] for frame in left)
-    np.testing.assert_array_equal(made.depth, ROOM.depth[left])
-
-
 @pytest.mark.parametrize("lost", [0, 2, 4])
 def test_a_lost_frame_does_not_shift_the_others(lost):
     numbers = [number for number in range(5) if number != lost]
@@ -150,3 +143,48 @@ def test_our_own_are_found_by_time_where_no_name_fits():
     counted = dataclasses.replace(stating, settings={})  # seconds from the first frame of some video
     with pytest.raises(InputError, match=r"the result is of frames x, y"):
         found(counted, ["a", "b", "c"], stated - stated[0], "vggtjax")
+
+
+@pytest.fixture(scope="module")
+def model():
+    return tiny_model()
+
+
+def retrained(model):
+    params = jax.tree.map(lambda leaf: np.asarray(leaf) * np.float32(1.001), model.params)
+    return dataclasses.replace(model, params=params)
+
+
+def test_retrained_weights_are_another_model(tmp_path, model):
+    read = read_model(save_model(tmp_path / "m.safetensors", model.params, model.config))
+    read_again = read_model(save_model(tmp_path / "m.safetensors", retrained(model).params, model.config))
+    for one, other in ((model, retrained(model)), (read, read_again), (read, retrained(read))):
+        before, again = ModelSource(one, ["vggt"]).settings, ModelSource(one, ["vggt"]).settings
+        assert before == again
+        assert ModelSource(other, ["vggt"]).settings["model"]["sha256"] != before["model"]["sha256"]
+
+
+def test_methods_that_do_not_fuse_run_beside_those_that_do(monkeypatch, model):
+    fusion, calls = paper_rule(), []
+
+    def methods(model, clip, names, *, fusion, **_):
+        check_fuses(fusion, *names)  # as reconstruct_methods does
+        calls.append((names, fusion))
+
+    monkeypatch.setattr("vggtjax.pipeline.several.reconstruct_methods", methods)
+    monkeypatch.setattr("vggtjax.clips.clip.read_clip", lambda *_: None)
+    monkeypatch.setattr("vggtjax.clips.sources.open_source", lambda *_: None)
+    source = ModelSource(model, ["vggt4d", "4dvggt-d"], fusion=fusion)
+    sequence = LabelledSequence("s", (Path("0.png"),))
+    for group in source.groups:
+        source.results(group, sequence, no_stage)
+    assert calls == [(["vggt4d"], None), (["4dvggt-d"], fusion)]
+    with pytest.raises(InputError, match="'vggt4d' does not fuse"):
+        ModelSource(model, ["vggt4d"], fusion=fusion)
+
+
+@pytest.mark.parametrize("name", ["caf\udce9", "n" * 300, ""])
+def test_names_of_results_are_short_and_printable(tmp_path, name):
+    with pytest.raises(InputError, match="expected a short printable name") as error:
+        FolderSource({name: tmp_path})
+    assert str(error.value).isprintable()

@@ -1,5 +1,3 @@
-"""The ladder of methods: against the passes themselves, and what must hold for any model."""
-
 import re
 from dataclasses import replace
 
@@ -64,10 +62,7 @@ def passes(model, truth) -> Passes:
 @pytest.fixture(scope="module")
 def rows(model, truth) -> list[LadderRow]:
     seen = []
-    found = ladder(
-        model, truth, mask_pairs=(0, 2), batch_size=2,
-        progress=lambda done, total: seen.append((done, total)),
-    )  # fmt: skip
+    found = ladder(model, truth, mask_pairs=(0, 2), batch_size=2, progress=lambda *counts: seen.append(counts))
     assert seen == [(done, 2 * (1 + 4)) for done in range(1, 11)]
     return found
 
@@ -83,13 +78,11 @@ def only(rows, **wanted) -> LadderRow:
 
 
 def test_every_setting_has_a_row(rows):
-    masked = [
-        (name, source, pairs, "zero") for source in ("mined", "true") for pairs in (0, 2) for name in ABLATION[1:]
-    ]
+    sources, pairs = ("mined", "true"), (0, 2)
+    masked = [(name, source, number, "zero") for source in sources for number in pairs for name in ABLATION[1:]]
     settings = [("vggt", None, None, None), *masked]
-    assert [(row.clip, *(getattr(row, name) for name in SETTING)) for row in rows] == [
-        (clip, *setting) for clip in range(CLIPS) for setting in settings
-    ]
+    found = [(row.clip, *(getattr(row, name) for name in SETTING)) for row in rows]
+    assert found == [(clip, *setting) for clip in range(CLIPS) for setting in settings]
     assert not any(row.failure for row in rows)
 
 
@@ -158,9 +151,8 @@ def test_suppressing_nothing_is_the_plain_pass(rows):
 
 
 def test_what_the_truth_leaves_undefined_is_none(model, truth):
-    still = truth._replace(
-        dynamic_mask=np.zeros_like(truth.dynamic_mask), camera_from_world=np.tile(np.eye(3, 4), (CLIPS, FRAMES, 1, 1))
-    )
+    standing = np.tile(np.eye(3, 4), (CLIPS, FRAMES, 1, 1))
+    still = truth._replace(dynamic_mask=np.zeros_like(truth.dynamic_mask), camera_from_world=standing)
     row = ladder(model, still, methods=["vggt"], batch_size=2)[0]
     undefined = (row.abs_rel_dynamic, row.saliency_auc, row.centre_error, row.centre_error_ratio, row.point_distance)
     assert undefined == (None,) * 5
@@ -186,18 +178,8 @@ def test_a_model_gone_wrong_is_a_row_that_says_so(model, truth):
 @pytest.mark.parametrize(
     ("rotation", "centre", "abs_rel", "expected"),
     [
-        (
-            1.5,
-            0.01,
-            0.1,
-            "steadies the cameras .rotation better, .*; centres better, 0.020 -> 0.010; AbsRel better, 0.200",
-        ),
-        (
-            2.5,
-            0.02,
-            0.3,
-            "does not steady the cameras .rotation worse, 2.00° -> 2.50°; centres unchanged, .* worse, 0.200",
-        ),
+        (1.5, 0.01, 0.1, "steadies the cameras .rotation better, .*; centres better, 0.020 -> 0.010; AbsRel better"),
+        (2.5, 0.02, 0.3, "does not steady the cameras .rotation worse, 2.00° -> 2.50°; centres unchanged, .* worse"),
     ],
 )
 def test_words_follow_the_numbers(rows, rotation, centre, abs_rel, expected):

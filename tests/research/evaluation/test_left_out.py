@@ -1,5 +1,3 @@
-"""Frames that lack something are left out and named; the others are scored."""
-
 import dataclasses
 import json
 import sys
@@ -7,12 +5,12 @@ import sys
 import numpy as np
 import pytest
 
+from tests.shared.command import run
 from tests.shared.dataset_files import depth_png, write_plain
 from tests.shared.room import make_room
 from tests.shared.scored_room import room_and_truth
 from vggtjax.clips.media.sampling import Sampling
 from vggtjax.clips.truth import Truth
-from vggtjax.interface.commands import main as cli
 from vggtjax.interface.commands.evaluate import _frames_in_words
 from vggtjax.research.evaluation.datasets import DATASETS, chosen_frames
 from vggtjax.research.evaluation.metrics.trajectory import trajectory_errors
@@ -46,30 +44,15 @@ def scored(folder, result, *arguments, capsys):
     """Return exit code, console, and the record of the result of a sequence."""
     root = folder.parent.parent
     result.save(root / "mine/walk", only=("depth",))
-    code = cli.main(
-        [
-            "evaluate",
-            "plain",
-            str(folder.parent),
-            "--results",
-            f"mine={root / 'mine'}",
-            "--out",
-            str(root / "out"),
-            *list(arguments),
-        ]
-    )
-    shown = capsys.readouterr()
-    return code, shown.out + shown.err, json.loads((root / "out/results.json").read_text())["sequences"][0]
-
-
-def rows(folder):
-    return (folder / "world_from_camera.txt").read_text().splitlines()
+    words = ("plain", folder.parent, "--results", f"mine={root / 'mine'}", "--out", root / "out", *arguments)
+    code, out, err = run(capsys, "evaluate", *words)
+    return code, out + err, json.loads((root / "out/results.json").read_text())["sequences"][0]
 
 
 @pytest.mark.parametrize("lost", [["-inf"] * 16, ["nan"] * 16, ["0"] * 16])
 def test_a_pose_that_is_not_finite_leaves_its_frame_out(walk, capsys, lost):
     folder, result = walk
-    poses = rows(folder)
+    poses = (folder / "world_from_camera.txt").read_text().splitlines()
     poses[1] = " ".join(lost)
     (folder / "world_from_camera.txt").write_text("\n".join(poses))
     code, shown, record = scored(folder, result, capsys=capsys)
@@ -89,9 +72,8 @@ def test_a_pose_that_is_not_finite_leaves_its_frame_out(walk, capsys, lost):
     assert (folder.parent.parent / "out/table.md").stat().st_size > 100
     code, shown, record = scored(folder, result, "--strict", capsys=capsys)
     assert code == 2
-    assert record["reason"] == (
-        "1 of 4 frames have no pose: 00001; add them, or score the other frames, without --strict"
-    )
+    lost_one = "1 of 4 frames have no pose: 00001; add them, or score the other frames, without --strict"
+    assert record["reason"] == lost_one
     (folder / "world_from_camera.txt").write_text("\n".join([" ".join(lost)] * 2 + poses[2:]))
     _, _, record = scored(folder, result, capsys=capsys)
     assert "trajectory: there are 2 true cameras; an alignment needs 3" in " ".join(record["notes"])
@@ -111,8 +93,7 @@ def test_a_missing_frame_of_every_kind(walk, capsys):
         "masks": (1, ["00003"]),
         "pictures": (1, ["00002"]),
     }
-    assert record["frames"] == 3
-    assert record["metrics"]["mask_frames"] == 2
+    assert (record["frames"], record["metrics"]["mask_frames"]) == (3, 2)
     assert record["metrics"]["depth_pixels"] == 2 * ROOM.depth[0].size
     assert record["metrics"]["j_mean"] == 1
     assert record["metrics"]["ate"] < 1e-4  # each pose is still that of its own picture
@@ -125,9 +106,8 @@ def test_keyframes_are_scored_at_their_own_frames(walk, capsys):
     arrays = ("depth", "depth_confidence", "dynamic_mask", "camera_from_world", "intrinsics", "images", "source_size",
               "source_scale", "source_offset", "valid_box", "saliency")  # fmt: skip
     taken = {name: None if getattr(result, name) is None else getattr(result, name)[chosen] for name in arrays}
-    few = dataclasses.replace(
-        result, **taken, timestamps=None, frame_names=tuple(result.frame_names[frame] for frame in chosen)
-    )
+    names = tuple(result.frame_names[frame] for frame in chosen)
+    few = dataclasses.replace(result, **taken, timestamps=None, frame_names=names)
     code, shown, record = scored(folder, few, capsys=capsys)
     assert code == 0, shown
     assert "mine of walk: 1 of 4 frames have no result: 00002" in shown
@@ -203,10 +183,7 @@ def test_frames_are_left_out_by_number(walk, capsys):
     assert (record["frames"], record["settings"]["skip"], record["notes"][-1:]) == (3, "1", [])
     assert record["metrics"]["j_mean"] == 1  # each of its own frame
     code, _, record = scored(folder, result, "--skip", "0-9", capsys=capsys)
-    assert (code, record["reason"]) == (
-        2,
-        "skip leaves none of 4 frames of sequence walk; expected to leave one",
-    )
+    assert (code, record["reason"]) == (2, "skip leaves none of 4 frames of sequence walk; expected to leave one")
 
 
 def test_errors_of_cameras_are_those_of_the_frames_that_are_left():

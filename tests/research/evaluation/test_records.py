@@ -3,15 +3,18 @@
 import dataclasses
 import json
 import os
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
-from tests.shared.scored_room import SETTINGS, Perfect, run
+from tests.shared.scored_room import SETTINGS, Perfect, run, stage
+from vggtjax.errors import ResultError
+from vggtjax.interface.commands.report import Report
 from vggtjax.research.evaluation import tables
 from vggtjax.research.evaluation.page import is_report, write_report
 from vggtjax.research.evaluation.records import BOTH_OVER_ONE, Record, Records, costs, safe_name, summary
+from vggtjax.research.evaluation.run import Scoring, evaluate
 
 
 def redone(store, result, sequence, settings=SETTINGS, **options):
@@ -34,9 +37,8 @@ def test_what_is_finished_is_not_done_again(tmp_path, three):
 
     again = Perfect(room, ["vggt", "4dvggt-d"], ["vggt4d"])
     after = run(sequences, again, store)
-    assert again.calls == [
-        ("a", ("vggt4d",)), ("b", ("vggt", "4dvggt-d")), ("b", ("vggt4d",)), ("../c <i>", ("vggt4d",)),
-    ]  # fmt: skip
+    missing = [("a", "vggt4d"), ("b", "vggt", "4dvggt-d"), ("b", "vggt4d"), ("../c <i>", "vggt4d")]
+    assert again.calls == [(name, tuple(methods)) for name, *methods in missing]
     assert [(r.status, r.method) for r in after] == 3 * [("ok", "vggt"), ("ok", "4dvggt-d"), ("ok", "vggt4d")]
 
 
@@ -149,10 +151,8 @@ def test_means_and_costs_by_hand():
     ratio = {BOTH_OVER_ONE: pytest.approx(4 / 3)}
     assert costs(records[:2])["m"] == {"image features": 0.5, "first pass": 2.5, "second pass": 1.0} | ratio
     plain, both = (dataclasses.replace(records[0], method=name) for name in ("vggt", "4dvggt-d"))
-    assert costs([plain, both]) == {
-        "vggt": {"image features": 1.0, "first pass": 3.0},
-        "4dvggt-d": seconds | {BOTH_OVER_ONE: 1.5},
-    }
+    of_plain = {"image features": 1.0, "first pass": 3.0}
+    assert costs([plain, both]) == {"vggt": of_plain, "4dvggt-d": seconds | {BOTH_OVER_ONE: 1.5}}
 
 
 def test_tables_by_hand():
@@ -199,3 +199,68 @@ def test_all_files_of_a_report(tmp_path, three):
     assert is_report(out / "results.json")
     (out / "results.json").write_text('{"mine": 1}')
     assert not is_report(out / "results.json")
+
+
+NAMES = ["n" * 300, "caf\udce9[/x]"]
+
+
+class Picky(Perfect):
+    """Raises what no library raises on purpose, for the results of some sequences."""
+
+    def __init__(self, result, errors, method):
+        super().__init__(result, [method])
+        self.errors = errors
+
+    def results(self, names, sequence, on_stage):
+        if sequence.name in self.errors:
+            raise self.errors[sequence.name]
+        return super().results(names, sequence, on_stage)
+
+
+@pytest.mark.filterwarnings("ignore:the field of view")
+def test_sequences_of_odd_names_are_scored_and_those_that_raise_are_rows(tmp_path, three, capsys, caplog):
+    room, (sequence, *_) = three
+    less = dataclasses.replace(sequence, mask=None, world_from_camera=None, intrinsics=None)  # and so less to draw
+    sequences = [dataclasses.replace(less, name=name) for name in NAMES]
+
+    def broken(frame):
+        raise ZeroDivisionError("[/x] " + 5000 * "z" + "\n")
+
+    def never():
+        raise FileNotFoundError(2, "No such file", "caf\udce9")
+
+    sequences += [dataclasses.replace(sequence, name="unreadable", depth=broken)]
+    sequences += [dataclasses.replace(sequence, name=name) for name in ("second", "a")]
+    openers = {each.name: (lambda each=each: each) for each in sequences} | {"never": never}
+    source = Picky(room, {"second": IndexError("index 9 is out of bounds")}, method="[/y]")
+    out, report = tmp_path / "out", Report()
+    store = Records(out)
+    with report.running():
+        records = evaluate(openers, cast(Any, source), store, SETTINGS, Scoring(), on_stage=report.stage)
+    assert [record.status for record in records] == ["ok", "ok", "failed", "failed", "ok", "failed"]
+    assert all(record.name.isprintable() and len(record.name) < 120 for record in records)
+    assert records[2].reason.startswith("ZeroDivisionError: [/x] zzz")
+    assert records[3].reason == "IndexError: index 9 is out of bounds"
+    assert "FileNotFoundError: " in records[5].reason
+    assert all(record.reason.isprintable() and len(record.reason) <= 1000 for record in records)
+    assert "in results" in caplog.text  # the traceback of a mistake in the program
+    write_report(out, records, store, SETTINGS | {"root": "caf\udce9"})
+    assert "IndexError" in (out / "index.html").read_text()
+    assert "IndexError" in (out / "results.csv").read_text()
+    report.means({"[/y]": records[0].metrics})
+    assert "[/y]" in capsys.readouterr().out
+    again = Perfect(room, ["[/y]"])
+    evaluate({name: openers[name] for name in NAMES}, cast(Any, again), store, SETTINGS, Scoring(), on_stage=stage)
+    assert not again.calls
+
+
+def test_broken_curves_are_named_and_made_again(tmp_path, three):
+    room, sequences = three
+    store = Records(tmp_path)
+    records = run(sequences[:1], Perfect(room, ["vggt"]), store)
+    (tmp_path / "sequences/a/vggt.npz").write_bytes(b"nothing")
+    with pytest.raises(ResultError, match=r"vggt\.npz cannot be read: .* delete it and run again"):
+        store.curves(records[0])
+    again = Perfect(room, ["vggt"])
+    run(sequences[:1], again, store)
+    assert again.calls

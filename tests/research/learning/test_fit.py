@@ -15,11 +15,8 @@ from vggtjax.method.fusion.family import Observations, fuse, log_precisions, pap
 from vggtjax.research.learning.fit import FitClips, FitConfig, fit_fusion
 from vggtjax.research.learning.objectives import joint_negative_log_likelihood, unit_factor
 
-TRUE = paper_rule() | {
-    "scale": jnp.asarray([2.5, 1.5]),
-    "power": jnp.asarray([0.6, 1.3]),
-    "correlation": jnp.asarray(0.5),
-}
+_TRUE = {"scale": [2.5, 1.5], "power": [0.6, 1.3], "correlation": 0.5}
+TRUE = paper_rule() | {name: jnp.asarray(value) for name, value in _TRUE.items()}
 FAMILY = ("scale", "power", "correlation")
 STANDARD_ERRORS = {"scale": [0.0134, 0.0120], "power": [0.0082, 0.0082], "correlation": 0.0048}
 
@@ -154,9 +151,8 @@ def test_a_soft_mask_is_recovered():
     seen = Observations(d1, zero, d2, zero, (margin >= 0).astype(jnp.float32), margin, jnp.zeros((*shape, 4)))
     true = paper_rule() | {"offset": jnp.asarray(0.1), "temperature": jnp.asarray(0.05)}
     truth = fused(true, seen).depth + 0.02 * jnp.asarray(generator.normal(size=shape), jnp.float32)
-    config = FitConfig(
-        parse_family("scale+offset+temperature"), steps=STEPS, learning_rate=0.2, patience=60, clips_at_once=4
-    )
+    family = parse_family("scale+offset+temperature")
+    config = FitConfig(family, steps=STEPS, learning_rate=0.2, patience=60, clips_at_once=4)
     clips = FitClips(seen, truth)
     fit = fit_fusion(clips.taken(np.arange(8)), clips.taken(np.arange(8, 12)), config)
     assert float(fit.params["offset"]) == pytest.approx(0.1, abs=0.01)

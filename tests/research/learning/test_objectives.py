@@ -15,14 +15,9 @@ from tests.shared.generated import DYNAMIC, STATIC, clips
 from vggtjax.cameras import Cameras
 from vggtjax.method.fusion.family import Fused
 from vggtjax.research.evaluation.metrics.trajectory import rotation_error
+from vggtjax.research.learning import objectives
 from vggtjax.research.learning.distances import nearest_distance, point_cloud_distance, pose_error
-from vggtjax.research.learning.objectives import (
-    View,
-    geometric_loss,
-    negative_log_likelihood,
-    photometric_loss,
-    unit_factor,
-)
+from vggtjax.research.learning.objectives import geometric_loss, negative_log_likelihood, photometric_loss
 
 
 def fused_of(depth, log_precision) -> Fused:
@@ -51,10 +46,9 @@ def test_likelihoods_are_scipys(kind, density):
         return -density.logpdf(depth[known], factor * truth[known], spread).mean()
 
     best: Any = minimize_scalar(wanted, bracket=(0.5, 1.0))
-    assert float(negative_log_likelihood(fused, jnp.asarray(truth, jnp.float32), kind)) == pytest.approx(
-        best.fun, rel=1e-4
-    )
-    factor = unit_factor(fused, jnp.where(known, truth, 1).astype(jnp.float32), jnp.asarray(known), kind)
+    found = negative_log_likelihood(fused, jnp.asarray(truth, jnp.float32), kind)
+    assert float(found) == pytest.approx(best.fun, rel=1e-4)
+    factor = objectives.unit_factor(fused, jnp.where(known, truth, 1).astype(jnp.float32), jnp.asarray(known), kind)
     assert wanted(float(factor)) == pytest.approx(best.fun, rel=1e-5)
 
 
@@ -65,7 +59,7 @@ def test_clips_have_no_unit_in_common():
     assert np.isclose(negative_log_likelihood(fused, truth), np.mean(each))
     clip = clips(STATIC, 2)
     fused = fused_of(clip.depth * np.array([1, 3], np.float32).reshape(2, 1, 1, 1), 0.0)
-    views = View(clip.images, Cameras(clip.camera_from_world, clip.intrinsics))
+    views = objectives.View(clip.images, Cameras(clip.camera_from_world, clip.intrinsics))
     for loss in (photometric_loss, geometric_loss):
         each = [loss(*jax.tree.map(lambda x: x[i], (fused, views))) for i in range(2)]  # noqa: B023
         assert np.isclose(loss(fused, views), np.mean(each))
@@ -95,26 +89,24 @@ def test_likelihoods_of_extremes_have_no_nan(kind):
     depth = jnp.asarray([[[0.0, 1e6, 1.0, 1.0]]])
     truth = jnp.asarray([[[1.0, 1e-3, 0.0, 1.0]]])
 
-    def loss(log_precision):
+    def loss(log_precision, truth):
         return negative_log_likelihood(fused_of(depth, log_precision), truth, kind)
 
     with jax.debug_nans(True):
         for log_precision in (0.0, 69.0, -69.0):
-            value, gradient = jax.jit(jax.value_and_grad(loss))(jnp.full((1, 1, 4), log_precision))
+            value, gradient = jax.jit(jax.value_and_grad(loss))(jnp.full((1, 1, 4), log_precision), truth)
             assert np.isfinite(value)
             assert np.isfinite(gradient).all()
-        assert float(loss(jnp.zeros((1, 1, 4)))) > 0
-        unknown = jnp.zeros((1, 1, 4))
-        value, gradient = jax.value_and_grad(lambda x: negative_log_likelihood(fused_of(depth, x), unknown, kind))(
-            unknown
-        )
+        zero = jnp.zeros((1, 1, 4))
+        assert float(loss(zero, truth)) > 0
+        value, gradient = jax.value_and_grad(loss)(zero, zero)  # nothing is known
         assert float(value) == 0
         assert not np.asarray(gradient).any()
 
 
 def scene(index: int = 0, config=STATIC):
     clip = jax.tree.map(lambda x: jnp.asarray(x[index]), clips(config, 4))
-    view = View(clip.images, Cameras(clip.camera_from_world, clip.intrinsics))
+    view = objectives.View(clip.images, Cameras(clip.camera_from_world, clip.intrinsics))
     moves = clip.dynamic_mask.astype(jnp.float32)
     return clip, view, Fused(clip.depth, jnp.full(clip.depth.shape, 4.0), moves, moves)
 
@@ -142,10 +134,9 @@ def test_geometric_consistency_knows_the_variance():
     """Depth with noise of a known precision, of a still camera: the objective is lowest at that precision."""
     generator = np.random.default_rng(0)
     depth = 2 + 0.1 * generator.laplace(size=(4, 24, 32)) / np.sqrt(2)
-    cameras = Cameras(
-        jnp.tile(jnp.eye(3, 4), (4, 1, 1)), jnp.tile(jnp.asarray([[30.0, 0, 16], [0, 30, 12], [0, 0, 1]]), (4, 1, 1))
-    )
-    view = View(jnp.zeros((4, 24, 32, 3)), cameras)
+    K = jnp.asarray([[30.0, 0, 16], [0, 30, 12], [0, 0, 1]])
+    cameras = Cameras(jnp.tile(jnp.eye(3, 4), (4, 1, 1)), jnp.tile(K, (4, 1, 1)))
+    view = objectives.View(jnp.zeros((4, 24, 32, 3)), cameras)
     loss_at = jax.jit(lambda guess: geometric_loss(fused_of(depth, guess), view))
     guesses = np.arange(2, 8, 0.25)
     losses = [float(loss_at(guess)) for guess in guesses]
@@ -177,9 +168,8 @@ def test_gradients_of_consistency_by_finite_differences():
 
 def poses(seed: int, count: int = 5) -> np.ndarray:
     generator = np.random.default_rng(seed)
-    return np.concatenate(
-        [Rotation.random(count, generator).as_matrix(), generator.normal(size=(count, 3, 1))], axis=2
-    ).astype(np.float32)
+    turns, places = Rotation.random(count, generator).as_matrix(), generator.normal(size=(count, 3, 1))
+    return np.concatenate([turns, places], axis=2).astype(np.float32)
 
 
 def test_pose_error_by_other_means():
@@ -222,6 +212,5 @@ def test_nearest_points_are_the_trees():
     found = nearest_distance(jnp.asarray(points, jnp.float32), jnp.asarray(others, jnp.float32))
     assert np.allclose(found, KDTree(others).query(points)[0], atol=1e-5)
     both = (KDTree(others).query(points)[0].mean() + KDTree(points).query(others)[0].mean()) / 2
-    assert float(point_cloud_distance(*(jnp.asarray(x, jnp.float32) for x in (points, others)))) == pytest.approx(
-        both, rel=1e-5
-    )
+    distance = point_cloud_distance(*(jnp.asarray(x, jnp.float32) for x in (points, others)))
+    assert float(distance) == pytest.approx(both, rel=1e-5)

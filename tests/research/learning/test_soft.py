@@ -35,10 +35,8 @@ def images(seed: int = 0) -> jax.Array:
     return jnp.asarray(np.random.default_rng(seed).random(SHAPE), jnp.float32)
 
 
-softly = jax.jit(
-    reconstruct_soft,
-    static_argnames=("config", "gram", "motion", "stop_camera_gradient", "compute_dtype", "remat"),
-)
+_STATIC = ("config", "gram", "motion", "stop_camera_gradient", "compute_dtype", "remat")
+softly = jax.jit(reconstruct_soft, static_argnames=_STATIC)
 
 
 @pytest.mark.parametrize("threshold", [None, pytest.param("multi-otsu", marks=pytest.mark.proof)])
@@ -55,9 +53,8 @@ def test_at_temperature_0_it_is_the_method(threshold):
 
 @jax.jit
 def _second(tree, pictures, tokens, mask_pairs=5, strength=None):
-    return forward(
-        tree, pictures, CONFIG, dynamic_tokens=tokens, mask_pairs=mask_pairs, strength=strength, outputs=("camera",)
-    ).pose_encoding
+    how = {"dynamic_tokens": tokens, "mask_pairs": mask_pairs, "strength": strength}
+    return forward(tree, pictures, CONFIG, outputs=("camera",), **how).pose_encoding
 
 
 def test_shares_of_0_and_1_are_the_boolean_mask():
@@ -90,14 +87,15 @@ def _in_float64(tree):
     return jax.device_put(jax.tree.map(lambda x: np.asarray(x, np.float64), tree))
 
 
+@pytest.mark.proof
 def test_every_gradient_by_finite_differences():
     """Of depth, precision, points and cameras along a random direction of each knob: masks, fusion and a weight."""
     weights32, pictures32 = params(), images(1)
     with jax.enable_x64(True):
         weights, pictures = _in_float64(weights32), _in_float64(pictures32)
-        masking = _in_float64(soft_masking(CONFIG, temperature=0.15))._replace(
-            strength=jnp.asarray([0.9, 0.7, 0.4, 0.2]), exponents=jnp.asarray([1.2, 0.7, 1.0, 0.9, 1.1])
-        )
+        shares = {"strength": [0.9, 0.7, 0.4, 0.2], "exponents": [1.2, 0.7, 1.0, 0.9, 1.1]}
+        masking = _in_float64(soft_masking(CONFIG, temperature=0.15))
+        masking = masking._replace(**{name: jnp.asarray(values) for name, values in shares.items()})
         fusion = _in_float64(paper_rule()) | {"temperature": jnp.asarray(0.3), "floor": jnp.asarray([0.1, 0.2])}
         generator = np.random.default_rng(2)
         true = jnp.concatenate([jnp.tile(jnp.eye(3), (4, 1, 1)), jnp.asarray(generator.normal(size=(4, 3, 1)))], axis=2)
@@ -107,9 +105,8 @@ def test_every_gradient_by_finite_differences():
         def loss(knobs):
             masking, fusion, bias = knobs
             tree = weights | {"aggregator": weights["aggregator"] | {"camera_token": bias}}
-            made = reconstruct_soft(
-                tree, pictures, CONFIG, masking, fusion, stop_camera_gradient=False, compute_dtype="float64", remat=True
-            )
+            how = {"stop_camera_gradient": False, "compute_dtype": "float64", "remat": True}
+            made = reconstruct_soft(tree, pictures, CONFIG, masking, fusion, **how)
             outputs = {
                 "depth": jnp.mean(mix[0] * made.depth) + jnp.mean(mix[1] * made.log_precision),
                 "cameras": sum(pose_error(made.cameras.camera_from_world[0], true)),

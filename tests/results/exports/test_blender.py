@@ -71,9 +71,7 @@ def test_pictures_of_several_sizes_are_refused(tmp_path):
     for name, (height, width) in zip("abc", sizes.tolist(), strict=True):
         Image.new("RGB", (width, height)).save(tmp_path / f"pictures/{name}.png")
     source = open_source(str(tmp_path / "pictures"))
-    with pytest.raises(
-        InputError, match=r"frame 3 has 56 x 84 pixels and the first 84 x 56; .* leave out the pictures"
-    ):
+    with pytest.raises(InputError, match=r"frame 3 has 56 x 84 pixels and the first 84 x 56; .* leave out"):
         export_result(room, tmp_path / "out", "blender", source=source)
     assert not (tmp_path / "out").exists()
 

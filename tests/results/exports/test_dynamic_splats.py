@@ -1,5 +1,3 @@
-"""The data set for dynamic splats, read back by the readers of its two layouts."""
-
 import json
 from typing import Any
 
@@ -21,15 +19,13 @@ FRAMES, H, W = 10, 28, 42
 @pytest.fixture(scope="module")
 def room():
     random = np.random.default_rng(0)
-    poses = np.concatenate(
-        [Rotation.random(FRAMES, rng=random).as_matrix(), random.normal(size=(FRAMES, 3, 1))], axis=-1
-    )
+    turns, places = Rotation.random(FRAMES, rng=random).as_matrix(), random.normal(size=(FRAMES, 3, 1))
+    poses = np.concatenate([turns, places], axis=-1).astype(np.float32)
     intrinsics = np.tile(np.array([[37, 0, 24], [0, 31, 12], [0, 0, 1]], np.float32), (FRAMES, 1, 1))
     times = 3 + np.array([0, 1, 2, 3, 5, 6, 7, 8, 9, 10.0])
     box = np.tile([2, 0, W, H], (FRAMES, 1))
-    return make_room(
-        FRAMES, H, W, camera_from_world=poses.astype(np.float32), intrinsics=intrinsics, timestamps=times, valid_box=box
-    )
+    changes = {"intrinsics": intrinsics, "timestamps": times, "valid_box": box}
+    return make_room(FRAMES, H, W, camera_from_world=poses, **changes)
 
 
 @pytest.fixture(scope="module")

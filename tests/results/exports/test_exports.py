@@ -4,7 +4,6 @@ import csv
 import json
 import os
 import re
-import struct
 import subprocess
 import sys
 from collections import Counter
@@ -73,31 +72,6 @@ def test_colmap_reads_the_model_and_projects_its_points(tmp_path, result, pictur
         np.testing.assert_array_less(np.abs(point.color.astype(int) - 60) % 40, 1)  # of the wall
         pixels = [image.project_point(point.xyz) for image in images]
         assert any(pixel is not None and (pixel >= 0).all() for pixel in pixels)
-    positions, errors = read_as_trainers_do(tmp_path / "out/sparse/0", form == "colmap")
-    np.testing.assert_allclose(sorted(positions), sorted(point.xyz.tolist() for point in model.points3D.values()))
-    assert set(errors) == {-1}
-    if form == "colmap":
-        for number, name in enumerate(names):
-            view = read_views(tmp_path / "out/sparse/0")[name]
-            np.testing.assert_allclose(view.camera_from_world, result.camera_from_world[number], atol=1e-6)
-            np.testing.assert_allclose(view.intrinsics[:2] / scale, result.intrinsics[number][:2], rtol=1e-6)
-
-
-def read_as_trainers_do(folder, binary):
-    """Read positions and errors of points record by record, as the loaders of splats do, and step over their tracks."""
-    if not binary:
-        lines = (folder / "points3D.txt").read_text().splitlines()
-        words = [line.split() for line in lines if not line.startswith("#")]
-        return [list(map(float, word[1:4])) for word in words], [float(word[7]) for word in words]
-    data, place = (folder / "points3D.bin").read_bytes(), 8
-    positions, errors = [], []
-    for _ in range(*struct.unpack_from("<Q", data)):
-        _, *position, _, _, _, error, length = struct.unpack_from("<QdddBBBdQ", data, place)
-        place += struct.calcsize("<QdddBBBdQ") + 8 * length
-        positions.append(position)
-        errors.append(error)
-    assert place == len(data)
-    return positions, errors
 
 
 @pytest.mark.parametrize("original", [False, True])
@@ -111,7 +85,8 @@ def test_tracks_of_the_result_are_the_observations_of_colmap(tmp_path, result, p
     inside = np.column_stack([query, np.ones(3)]) @ np.linalg.inv(result.intrinsics[1]).T
     inside *= result.depth[1, rows, columns, None]
     world = (inside - result.camera_from_world[1, :, 3]) @ result.camera_from_world[1, :, :3]
-    positions = np.stack([np.column_stack(project(world, pose, K)[:2]) for pose, K in cameras_of(result)])
+    cameras = zip(result.camera_from_world.astype(float), result.intrinsics.astype(float), strict=True)
+    positions = np.stack([np.column_stack(project(world, pose, K)[:2]) for pose, K in cameras])
     positions[3, 0] += (0, 3)
     moving = np.argwhere(result.dynamic_mask[1])[0][::-1] + 0.5
     positions = np.concatenate([positions, np.broadcast_to(moving, (FRAMES, 1, 2))], axis=1)
@@ -131,10 +106,6 @@ def test_tracks_of_the_result_are_the_observations_of_colmap(tmp_path, result, p
     (wrong,) = [point for point in measured if point.error > 0.01]
     np.testing.assert_allclose(wrong.error, (2 if original else 1) * 3 / inside[:, 0].sum(), rtol=1e-3)
     assert any(point.error == -1 for point in model.points3D.values())
-
-
-def cameras_of(result):
-    return zip(result.camera_from_world.astype(float), result.intrinsics.astype(float), strict=True)
 
 
 def test_each_frame_of_the_animation_shows_its_own_points(tmp_path, result):
@@ -331,9 +302,8 @@ def test_a_result_without_a_mask_has_mask_files_for_padding_alone(tmp_path, resu
         assert (tmp_path / "out" / name).exists() == (padded and name in kept.split())
     if form == "nerfstudio":
         frames = json.loads((tmp_path / "out/transforms.json").read_text())["frames"]
-        assert [(tmp_path / "out" / frame["mask_path"]).is_file() for frame in frames if "mask_path" in frame] == (
-            [True] * FRAMES * padded
-        )
+        masks = [frame["mask_path"] for frame in frames if "mask_path" in frame]
+        assert [(tmp_path / "out" / name).is_file() for name in masks] == [True] * FRAMES * padded
     if form == "colmap" and padded:
         (path,) = (tmp_path / "out/masks").iterdir()
         assert path.name == "a1.png.png"

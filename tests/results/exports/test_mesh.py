@@ -1,5 +1,3 @@
-"""The mesh of the static part: where it lies, what it leaves out, and how large it may become."""
-
 import re
 from typing import Any
 
@@ -56,15 +54,6 @@ def test_static_surfaces_alone_in_colour_and_facing_the_cameras():
     assert np.ptp(colors, axis=0).min() > 30
 
 
-def test_noise_of_frames_is_averaged():
-    room = make_room(8, 56, 84)
-    noise = np.random.default_rng(0).normal(scale=0.05, size=room.depth.shape)
-    noisy = make_room(8, 56, 84, depth=(room.depth + noise).astype(np.float32))
-    mesh = static_mesh(noisy, ALL)
-    points = noisy.world_points()[~noisy.dynamic_mask]
-    assert np.abs(mesh.vertices[:, 2] - WALL).mean() < 0.5 * np.abs(points[:, 2] - WALL).mean()
-
-
 @pytest.mark.parametrize("confidence", [0.0, 3.4e38])
 def test_confidence_of_any_size_gives_finite_vertices_with_colours(confidence):
     mesh = static_mesh(make_room(depth_confidence=np.full((3, 28, 42), confidence, np.float32)), ALL)
@@ -89,14 +78,11 @@ def test_files(tmp_path):
 
 def test_what_cannot_be_a_mesh_is_one_sentence(tmp_path):
     room = make_room()
-    with pytest.raises(
-        InputError, match=r"voxels of 0.001 need \d+ x \d+ x \d+ of them, more than 67108864 in all"
-    ) as found:
+    with pytest.raises(InputError, match=r"voxels of 0.001 need \d+ x \d+ x \d+ of them, more than 67108864") as found:
         export_result(room, tmp_path / "out.glb", "mesh", exporting=Exporting(voxel_size=0.001))
-    smallest = re.search(r"the smallest that fit are (\S+)", str(found.value))
-    assert smallest is not None
+    (smallest,) = re.findall(r"the smallest that fit are ([\d.]+)", str(found.value))
     surfaces = StaticSurfaces(room, 20.0)
-    assert 0.9 * MOST_VOXELS < np.prod(surfaces.grid(float(smallest[1])).shape) <= MOST_VOXELS
+    assert 0.9 * MOST_VOXELS < np.prod(surfaces.grid(float(smallest)).shape) <= MOST_VOXELS
     with pytest.raises(InputError, match="voxels of 1e-200 need"):
         surfaces.grid(1e-200)
     moving = make_room(dynamic_mask=np.ones((3, 28, 42), bool))

@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+from functools import partial
 
 import numpy as np
 import pytest
@@ -51,16 +52,16 @@ def page(browser):
     page.close()
 
 
-def drawn(page):
+def pixels_of(page):
     """Return the pixels above the time line."""
-    page.evaluate(DRAWN)
     shot = page.screenshot(clip={"x": 0, "y": 0, "width": 630, "height": 420})
     return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"), int)
 
 
 def red(page):
     """Return the pixels of the moving box on the screen, at the size of a frame."""
-    pixels = drawn(page)
+    page.evaluate(DRAWN)
+    pixels = pixels_of(page)
     found = (pixels[..., 0] > 150) & (pixels[..., 1] < 90) & (pixels[..., 2] < 90)
     return found.reshape(HEIGHT, 420 // HEIGHT, WIDTH, 630 // WIDTH).mean(axis=(1, 3)) > 0.5
 
@@ -73,13 +74,6 @@ def agreement(shown, mask):
 
 def set_slider(page, name, value):
     page.locator(name).evaluate("(one, value) => { one.value = value; one.dispatchEvent(new Event('input')) }", value)
-
-
-def look_through_the_clips_camera(page):
-    """The scene then is the picture."""
-    set_slider(page, "#least-moving", 0)
-    page.locator("#pictures").evaluate("box => box.click()")
-    page.keyboard.press("f")
 
 
 def open_page(page, folder, results, **options):
@@ -99,7 +93,9 @@ def test_the_page_opens_from_a_file_plays_and_shows_the_frame_that_is_due(page, 
     page.keyboard.press("Space")
     assert not page.evaluate("window.vggtjax.viewer.playing")
 
-    look_through_the_clips_camera(page)
+    set_slider(page, "#least-moving", 0)
+    page.locator("#pictures").evaluate("box => box.click()")
+    page.keyboard.press("f")  # through the clip's camera the scene is the picture
     for frame in (0, FRAMES // 2, FRAMES - 1):
         set_slider(page, "#time", frame)
         assert agreement(red(page), room.dynamic_mask[frame]) > 0.75
@@ -131,8 +127,7 @@ BRIGHT, DARK = (64, 255, 242), (5, 13, 26)  # the rims of the halo
 
 def rims(page):
     """Return the number of pixels of each rim."""
-    shot = page.screenshot(clip={"x": 0, "y": 0, "width": 630, "height": 420})
-    pixels = np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"), int)
+    pixels = pixels_of(page)
     return [np.count_nonzero(np.abs(pixels - color).max(axis=-1) < 4) for color in (BRIGHT, DARK)]
 
 
@@ -157,9 +152,8 @@ def test_where_nothing_is_to_move_by_itself_the_halo_is_still_there(page, room, 
     page.evaluate(DRAWN)
     page.mouse.move(300, 200)  # is no touch
     assert min(rims(page)) > 100
-    {"wheel": lambda: page.mouse.wheel(0, 30), "pointer": page.mouse.down, "key": lambda: page.keyboard.press("x")}[
-        touch
-    ]()
+    wheel, key = partial(page.mouse.wheel, 0, 30), partial(page.keyboard.press, "x")
+    {"wheel": wheel, "pointer": page.mouse.down, "key": key}[touch]()
     page.evaluate(until("window.vggtjax.viewer.halo === 0"))
     page.evaluate(DRAWN)
     assert max(rims(page)) < 20

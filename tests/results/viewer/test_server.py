@@ -1,5 +1,3 @@
-"""The server answers with one page, to those who may see it."""
-
 import http.client
 import threading
 from contextlib import contextmanager

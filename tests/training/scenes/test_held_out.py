@@ -1,7 +1,6 @@
-"""Test scenes: as hard as is asked, the same every time, whatever the size and the count."""
-
 import dataclasses
 import functools
+from typing import Any
 
 import jax
 import numpy as np
@@ -20,18 +19,17 @@ def quick(keys, textures, config):
     return jax.vmap(lambda key: generate(key, textures, config))(keys)
 
 
-@pytest.fixture(autouse=True)
-def quickly_compiled(monkeypatch):
-    monkeypatch.setattr(held_out, "_generate", quick)
-    monkeypatch.setattr(held_out, "SIZE", JUDGED.height)
+@pytest.fixture(scope="module", autouse=True)
+def quickly_compiled():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(held_out, "_generate", quick)
+        patch.setattr(held_out, "SIZE", JUDGED.height)
+        yield
 
 
 @pytest.fixture(scope="module")
 def dynamic():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(held_out, "_generate", quick)
-        patch.setattr(held_out, "SIZE", JUDGED.height)
-        return held_out_scenes("dynamic", 3, JUDGED)
+    return held_out_scenes("dynamic", 3, JUDGED)
 
 
 @pytest.mark.proof
@@ -91,3 +89,23 @@ def test_frozen_scenes_are_twins_of_those_that_move():
     still = ~(moving.dynamic_mask | frozen.dynamic_mask)
     assert np.abs(moving.depth - frozen.depth)[still].max() < 1e-3
     assert frozen.dynamic_mask.any()
+
+
+def test_bad_values_are_one_sentence():
+    cases: Any = (
+        ({"height": 7}, "height is 7; expected a whole number of at least 8 and at most 2048"),
+        ({"dynamic": 1.5}, "dynamic is 1.5; expected a number of at least 0 and at most 1"),
+        ({"motion": (0.0, 3.0)}, r"motion\[1\] is 3.0; expected a number"),
+        ({"pitch": (0.0, 90.0)}, r"pitch\[1\] is 90.0; expected a number of at least -60 and at most 60"),
+        ({"motion": [[10**400], 1]}, r"motion\[0\]\[0\] is a number of more than 64 bits"),
+        ({"frozen": [[]]}, r"frozen is \[\[\]\]; expected true or false"),
+    )
+    for changes, says in cases:
+        with pytest.raises(InputError, match=says):
+            SceneConfig(**changes)
+
+
+def test_parts_of_the_figure_come_first_in_each_kind():
+    config = SceneConfig(boxes=2, ellipsoids=1, cylinders=1)
+    assert config.kinds == ("box",) * 3 + ("ellipsoid",) * 2 + ("cylinder",) * 5
+    assert config.objects == (0, 1, 2, 0, 3, 0, 0, 0, 0, 4)

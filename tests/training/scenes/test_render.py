@@ -1,4 +1,4 @@
-"""The renderer is exact: what one frame's truth says of a point, another frame's rays find there."""
+"""The renderer is exact: what one frame's truth says of a point, another frame's rays find there; and its shapes."""
 
 import dataclasses
 from typing import NamedTuple
@@ -7,10 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
 
 from tests.shared.generated import DYNAMIC, QUICK, STATIC, clips, gauge, keys, scenes, textures
 from vggtjax.training.scenes import cast, sample_scene
 from vggtjax.training.scenes.scene import camera_pose, part_poses
+from vggtjax.training.scenes.shapes import SHAPES, box_normal, cylinder_normal, ellipsoid_normal
 
 COUNT = 6
 S, H, W = DYNAMIC.frames, DYNAMIC.height, DYNAMIC.width
@@ -65,9 +68,8 @@ def look():
 def pairs(dynamic):
     """Every ordered pair of frames of every clip."""
     sizes = np.asarray(scenes(DYNAMIC, COUNT).size, np.float64)
-    return [
-        carried(dynamic, sizes[clip], clip, i, j) for clip in range(COUNT) for j in range(S) for i in range(S) if i != j
-    ]
+    places = [(clip, i, j) for clip, j, i in np.ndindex(COUNT, S, S) if i != j]
+    return [carried(dynamic, sizes[clip], clip, i, j) for clip, i, j in places]
 
 
 def carried(truth, sizes, clip, i, j):
@@ -222,3 +224,53 @@ def test_samples_and_exposures_change_images_only(dynamic):
     difference = np.abs(blurred.images - sharp.images)
     assert difference.max() > 0.1
     assert difference.mean() < 0.05  # it is the same scene
+
+
+SIZE = (1.0, 2.0, 3.0)
+
+
+def test_normals_by_hand():
+    size = jnp.asarray(SIZE)[:, None] * jnp.ones((1, 4))
+    points = jnp.asarray([(1, 0.5, 0.5), (-0.2, -2, 1), (0, 1.9, -3), (-1, 1.9, 2.9)]).T
+    np.testing.assert_array_equal(box_normal(points, size).T, [(1, 0, 0), (0, -1, 0), (0, 0, -1), (-1, 0, 0)])
+
+    size = jnp.asarray([2.0, 1, 1])[:, None] * jnp.ones((1, 3))
+    points = jnp.asarray([(2, 0, 0), (0, 0, -1), (2**0.5, 0.5**0.5, 0)]).T  # the last: gradient (x / 4, y)
+    expected = [(1, 0, 0), (0, 0, -1), (0.2**0.5, 0.8**0.5, 0)]
+    np.testing.assert_allclose(ellipsoid_normal(points, size).T, expected, atol=1e-6)
+
+    size = jnp.asarray([2.0, 1, 1])[:, None] * jnp.ones((1, 4))
+    points = jnp.asarray([(0.1, 1, 0.1), (-1, -1, 0.5), (-2, 0.3, 0), (2**0.5, -0.9, 0.5**0.5)]).T
+    expected = [(0, 1, 0), (0, -1, 0), (-1, 0, 0), (0.2**0.5, 0, 0.8**0.5)]
+    np.testing.assert_allclose(cylinder_normal(points, size).T, expected, atol=1e-6)
+
+
+coordinate = st.floats(-1, 1)
+vector = st.tuples(coordinate, coordinate, coordinate)
+extent = st.floats(0.2, 2)
+
+
+@pytest.mark.parametrize("shape", list(SHAPES))
+@settings(max_examples=40)
+@given(start=vector, through=vector, size=st.tuples(extent, extent, extent))
+def test_a_ray_enters_and_leaves_on_the_surface(shape, start, through, size):
+    origin, size = 8 * np.array(start), np.array(size)
+    direction = 2 * np.array(through) * size - origin  # towards the shape or past it
+    assume(np.linalg.norm(direction) > 0.5)
+    eye, ray = (jnp.asarray(v, jnp.float32)[None, :, None] for v in (origin, direction))
+    near, far = (float(reach[0, 0]) for reach in SHAPES[shape][0](eye, ray, jnp.asarray(size, jnp.float32)[None]))
+    along = np.linspace(-4, 6, 2001)
+    outward = gauge(shape, origin + along[:, None] * direction, size)
+    if not near < far:
+        assert outward.min() > 1 - 2e-2  # a ray that just touches may be called a miss
+        return
+    points = origin + np.array([[near], [(near + far) / 2], [far]]) * direction
+    at = gauge(shape, points, size)
+    assert at[[0, 2]] == pytest.approx(1, abs=2e-3)
+    assert at[1] < 1 + 2e-3
+    clear = (np.abs(along - near) > 0.02) & (np.abs(along - far) > 0.02) & (np.abs(outward - 1) > 1e-2)
+    np.testing.assert_array_equal((outward < 1)[clear], ((near < along) & (along < far))[clear])
+    assume((far - near) * np.linalg.norm(direction) > 0.1)
+    normal = np.asarray(SHAPES[shape][1](jnp.asarray(points[[0]].T), jnp.asarray(size[:, None])))[:, 0]
+    assert np.linalg.norm(normal) == pytest.approx(1, abs=1e-5)
+    assert normal @ direction < 0.05 * np.linalg.norm(direction)  # faces the ray, but at an edge it may be the other's

@@ -1,5 +1,3 @@
-"""Captures as ground truth."""
-
 import numpy as np
 import pytest
 

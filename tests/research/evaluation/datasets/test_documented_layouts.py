@@ -3,40 +3,21 @@
 import json
 import re
 from collections.abc import Iterator
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 
-from tests.shared.dataset_files import (
-    cam,
-    camera_json,
-    cameras_bin,
-    depth_png,
-    dpt,
-    images_bin,
-    npy,
-    opened,
-    picture,
-    png,
-    write,
-)
+from tests.shared import dataset_files as made
+from tests.shared.dataset_files import opened, write
 from tests.shared.documented import DOCS
 from vggtjax.research.evaluation.datasets import DATASETS
 
 PAGE = (DOCS / "reference" / "evaluation-protocols.md").read_text()
 ROW = "1 0 0 0 0 1 0 0 0 0 1 0"
-TRANSFORMS = {
-    **{"w": 4, "h": 3, "fl_x": 4.0, "fl_y": 4.0, "cx": 2.0, "cy": 1.5, "camera_model": "PINHOLE"},
-    "frames": [
-        {
-            "file_path": "images/frame_00001.png",
-            "depth_file_path": "depth/frame_00001.png",
-            "transform_matrix": np.eye(4).tolist(),
-        }
-    ],
-}
+_FRAME = {"file_path": "images/frame_00001.png", "depth_file_path": "depth/frame_00001.png"}
+_CAMERA = {"w": 4, "h": 3, "fl_x": 4.0, "fl_y": 4.0, "cx": 2.0, "cy": 1.5, "camera_model": "PINHOLE"}
+TRANSFORMS = _CAMERA | {"frames": [_FRAME | {"transform_matrix": np.eye(4).tolist()}]}
 K = [[4.0, 0, 1.5], [0, 4.0, 1], [0, 0, 1]]
 
 
@@ -47,12 +28,12 @@ def _lines(says: str) -> str:
 
 # What is in the files: the first pattern that the end of a path fits.
 CONTENTS = {
-    r"(Annotations|mask)/.*\.png": png(np.full((3, 4), 255, np.uint8)),
-    r"(rgb|images|final|image_02/data|image_gathered|480p)/.*|color\.png": picture(),
-    r"depth.*\.png": depth_png([[1000] * 4] * 3),
-    r"\.npy": npy(np.ones((3, 4), np.float32)),
-    r"\.dpt": dpt(np.ones((3, 4))),
-    r"\.cam": cam(K, np.eye(3, 4)),
+    r"(Annotations|mask)/.*\.png": made.png(np.full((3, 4), 255, np.uint8)),
+    r"(rgb|images|final|image_02/data|image_gathered|480p)/.*|color\.png": made.picture(),
+    r"depth.*\.png": made.depth_png([[1000] * 4] * 3),
+    r"\.npy": made.npy(np.ones((3, 4), np.float32)),
+    r"\.dpt": made.dpt(np.ones((3, 4))),
+    r"\.cam": made.cam(K, np.eye(3, 4)),
     r"K\.txt": "4 0 2\n0 4 1.5\n0 0 1\n",
     r"world_from_camera\.txt": f"{ROW}\n",
     r"transforms\.json": json.dumps(TRANSFORMS),
@@ -61,9 +42,9 @@ CONTENTS = {
     r"groundtruth\.txt": _lines("0 0 0 0 0 0 1"),
     r"calibration\.txt": "4 4 2 1.5\n",
     r"train\.json": json.dumps({"frame_names": ["0_00000"]}),
-    r"camera/0_00000\.json": camera_json(),
-    r"cameras\.bin": cameras_bin([(1, 1, 4, 3, [4.0, 4.0, 2.0, 1.5])]),
-    r"images\.bin": images_bin([(1, (1, 0, 0, 0), (0, 0, 0), 1, "0_00000.png")]),
+    r"camera/0_00000\.json": made.camera_json(),
+    r"cameras\.bin": made.cameras_bin([(1, 1, 4, 3, [4.0, 4.0, 2.0, 1.5])]),
+    r"images\.bin": made.images_bin([(1, (1, 0, 0, 0), (0, 0, 0), 1, "0_00000.png")]),
     r"calib_cam_to_cam\.txt": "P_rect_02: 4 0 2 0 0 4 1 0 0 0 1 0\n",
     r"pose\.txt": "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n",
 }
@@ -94,11 +75,6 @@ def paths(tree: str) -> Iterator[str]:
             yield "".join(folders)
 
 
-def build(root: Path, tree: str) -> None:
-    for path in paths(tree):
-        write(root / path, next(content for end, content in CONTENTS.items() if re.search(f"(?:{end})$", f"/{path}")))
-
-
 CASES = [
     pytest.param(name, layout, gt, id=f"{name} {gt}{number}")
     for number, layout in enumerate(layouts())
@@ -115,7 +91,9 @@ def test_every_data_set_has_a_tree():
 @pytest.mark.filterwarnings("ignore")
 def test_files_of_a_tree_are_a_data_set(name, layout, gt, tmp_path):
     """With all the ground truth that the data set has."""
-    build(tmp_path, layout.tree)
+    for path in paths(layout.tree):
+        content = next(content for end, content in CONTENTS.items() if re.search(f"(?:{end})$", f"/{path}"))
+        write(tmp_path / path, content)
     roots = ["", *re.findall(r"`ROOT/([\w/-]+)`", layout.says.split(" too")[0])]
     for root in roots:
         (sequence,) = opened(name, tmp_path / root, gt=gt, stride=1)

@@ -1,5 +1,3 @@
-"""DyCheck's layout with its two ground truths, and the COLMAP models of one of them."""
-
 import json
 
 import numpy as np

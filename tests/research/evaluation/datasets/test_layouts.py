@@ -1,5 +1,3 @@
-"""Layouts of published data sets: files written byte by byte, values worked out by hand, and files that are broken."""
-
 import struct
 
 import numpy as np
@@ -77,9 +75,8 @@ def test_kitti_takes_the_first_110_and_names_what_is_missing(tmp_path):
     (tmp_path / "2011_09_26" / "calib_cam_to_cam.txt").unlink()
     (sequence,) = opened("kitti", tmp_path)
     assert [int(path.stem) for path in sequence.pictures] == [i for i in range(5, 115) if i not in (7, 9)]
-    assert f"{DRIVE}: 2 of 110 frames have no picture and are skipped: 0000000007, 0000000009; expected " in " ".join(
-        sequence.notes
-    )
+    skipped = f"{DRIVE}: 2 of 110 frames have no picture and are skipped: 0000000007, 0000000009; expected "
+    assert any(skipped in note for note in sequence.notes)
     assert f"{DRIVE}: it has no intrinsics; expected {tmp_path}/2011_09_26/calib_cam_to_cam.txt" in sequence.notes
     assert np.allclose(sequence.depth(2)[0], [0, 1, 0.5, 265 / 256])  # frame 8
 
@@ -107,9 +104,7 @@ def test_seven_scenes(tmp_path):
     assert np.allclose(sequence.depth(2), [[0, 0, 1.5, 1.002]] * 3)
     assert np.allclose(sequence.world_from_camera[2], [[0, 0, 1, 2], [0, 1, 0, 0.5], [-1, 0, 0, -1], [0, 0, 0, 1]])
     assert np.array_equal(sequence.intrinsics[0], [[585, 0, 320.5], [0, 585, 240.5], [0, 0, 1]])
-    assert sequence.notes == (
-        "chess/seq-10: depth is not registered to the pictures; the intrinsics are the depth camera's",
-    )
+    assert "depth is not registered to the pictures; the intrinsics are the depth camera's" in sequence.notes[0]
     folder = tmp_path / "chess" / "seq-02"
     (folder / "frame-000001.pose.txt").unlink()
     (sequence,) = opened("7scenes", folder)

@@ -1,5 +1,3 @@
-"""Saliency and masks: hand-computed values and properties."""
-
 import math
 
 import numpy as np
@@ -50,9 +48,8 @@ def slow_boundary_f(predicted, truth) -> float:
         return 1.0
     if not found.any() or not sought.any():
         return 0.0
-    precision, recall = (
-        (np.asarray(distance_transform_edt(~b))[a] <= radius).mean() for a, b in ((found, sought), (sought, found))
-    )
+    ways = ((found, sought), (sought, found))
+    precision, recall = ((np.asarray(distance_transform_edt(~b))[a] <= radius).mean() for a, b in ways)
     return 2 * precision * recall / (precision + recall) if precision + recall else 0.0
 
 
@@ -103,8 +100,6 @@ def test_pooled_scores_weigh_frames_alike():
     sequences = [(strips([90, 80]), full[:2]), (strips([10, 20, 30, 40, 50, 60]), full[:6])]
     pooled = pooled_scores(sequences)
     assert pooled == mask_scores(strips([90, 80, 10, 20, 30, 40, 50, 60]), full)
-    assert pooled.j_mean == pytest.approx(3.8 / 8)
-    assert pooled.j_recall == pytest.approx(3 / 8)
     nothing = np.zeros((1, 1, 100), bool)
     assert pooled_scores([(nothing, nothing)], empty="vggt4d").j_mean == 0
 

@@ -6,9 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from tests.test_cameras import random_similarity
 from vggtjax.errors import InputError
 from vggtjax.research.evaluation.metrics.trajectory import associate, centre_error, rotation_error, trajectory_errors
-from vggtjax.similarity import Similarity, align, centres, umeyama_sim3
+from vggtjax.similarity import align, centres, umeyama_sim3
 
 
 def cameras(points, rotation=None) -> np.ndarray:
@@ -20,15 +21,6 @@ def cameras(points, rotation=None) -> np.ndarray:
 
 def still(frames) -> np.ndarray:
     return cameras(np.zeros((frames, 3)))
-
-
-def random_cameras(generator, frames=7) -> np.ndarray:
-    return cameras(generator.normal(size=(frames, 3)), Rotation.random(frames, rng=generator))
-
-
-def random_similarity(generator) -> Similarity:
-    rotation = Rotation.random(rng=generator).as_matrix()
-    return Similarity(float(np.exp(generator.normal())), rotation, 5 * generator.normal(size=3))
 
 
 def about(axis, degrees) -> Rotation:
@@ -85,25 +77,6 @@ def wandering(generator, frames=30, noise=0.05) -> tuple[np.ndarray, np.ndarray]
     truth = cameras(centres_, turns)
     predicted = cameras(centres_ + noise * generator.normal(size=(frames, 3)), shaken)
     return world_from(align(predicted, random_similarity(generator))), world_from(truth)
-
-
-def test_trajectory_errors_by_hand():
-    truth = cameras([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
-    pulled = cameras([[2, 0, 0], [-2, 0, 0], [0, 1, 0], [0, -1, 0]])
-    predicted, truth = world_from(pulled), world_from(truth)
-    # The best scale is 0.6: centres at +-1.2 and +-0.6 instead of +-1, errors 0.2, 0.2, 0.4, 0.4. Steps: (-2.4, 0),
-    # (1.2, 0.6), (0, -1.2) instead of (-2, 0), (1, 1), (0, -2).
-    scaled = trajectory_errors(predicted, truth)
-    assert scaled.ate == pytest.approx(np.sqrt((2 * 0.04 + 2 * 0.16) / 4))
-    assert scaled.rte == pytest.approx(np.sqrt((0.16 + 0.04 + 0.16 + 0.64) / 3))
-    assert scaled.rre == pytest.approx(0, abs=1e-9)
-    # Without scale nothing moves: errors 1, 1, 0, 0 and (-2, 0), (1, 0), (0, 0).
-    rigid = trajectory_errors(predicted, truth, "se3")
-    assert rigid[:2] == pytest.approx((np.sqrt(1 / 2), np.sqrt(5 / 3)))
-    assert trajectory_errors(STILL, STILL, "first") == (0, 0, 0)
-    # From the first pose on: the prediction moves by -1 along x; errors 0, 2, 1, 1.
-    first = trajectory_errors(predicted, truth, "first")
-    assert first[:2] == pytest.approx((np.sqrt(6 / 4), np.sqrt(5 / 3)))
 
 
 @pytest.mark.parametrize("how", ["sim3", "se3", "first"])

@@ -1,29 +1,21 @@
-"""Claimed precision against errors: hand-computed values, properties, other definitions of the same."""
-
 import numpy as np
 import pytest
 
 from vggtjax.errors import InputError
-from vggtjax.research.evaluation.metrics.uncertainty import (
-    ause,
-    calibration_error,
-    gaussian_nll,
-    reliability_curve,
-    sparsification_curve,
-    uncertainty_scores,
-)
+from vggtjax.research.evaluation.metrics import uncertainty
+from vggtjax.research.evaluation.metrics.uncertainty import ause, calibration_error, uncertainty_scores
 
 
 def test_sparsification_by_hand():
     errors, confidence = np.array([4.0, -1, 2, 1]), np.array([1, 4, 3, 2])
-    curve = sparsification_curve(errors, confidence, steps=4)
+    curve = uncertainty.sparsification_curve(errors, confidence, steps=4)
     assert curve.fractions.tolist() == [0, 0.25, 0.5, 0.75]
     assert curve.remaining == pytest.approx([8 / 4, 4 / 3, 3 / 2, 1])  # without 4, then 1, then 2
     assert curve.oracle == pytest.approx([8 / 4, 4 / 3, 1, 1])  # without 4, then 2, then a 1
-    tied = sparsification_curve(np.array([3.0, 1, 8, 4]), np.array([1, 1, 0, 2]), steps=4)
+    tied = uncertainty.sparsification_curve(np.array([3.0, 1, 8, 4]), np.array([1, 1, 0, 2]), steps=4)
     assert tied.remaining == pytest.approx([4, 8 / 3, 3, 4])  # 8 goes first; then 2 and 2 for 3 and 1
     # Two steps more than there are pixels to take: shares of 1 / 8 of four pixels are rounded to the even half.
-    curve = sparsification_curve(errors, confidence, steps=8)
+    curve = uncertainty.sparsification_curve(errors, confidence, steps=8)
     assert curve.remaining == pytest.approx([2, 2, 4 / 3, 3 / 2, 3 / 2, 3 / 2, 1, 1])
 
 
@@ -32,7 +24,7 @@ def test_ause_by_hand():
     errors = np.zeros(20)
     errors[0] = 20
     confidence = np.r_[20, np.arange(19)]
-    curve = sparsification_curve(errors, confidence)
+    curve = uncertainty.sparsification_curve(errors, confidence)
     assert curve.remaining == pytest.approx(20 / np.arange(20, 0, -1))
     between = 20 / np.arange(20, 0, -1) - np.r_[1, np.zeros(19)]
     assert ause(errors, confidence) == pytest.approx((between.sum() - between[-1] / 2) / 20)
@@ -44,20 +36,20 @@ def test_likelihood_by_hand():
     errors, precision = np.array([1.0, -2, 3]), np.array([4.0, 1, 1])
     assert uncertainty_scores(9 + errors, np.full(3, 9.0), precision).scale == pytest.approx((4 + 4 + 9) / 3)
     by_hand = [(np.log(2 * np.pi / 4) + 4) / 2, (np.log(2 * np.pi) + 4) / 2, (np.log(2 * np.pi) + 9) / 2]
-    assert gaussian_nll(errors, precision, 1.0) == pytest.approx(np.mean(by_hand))
-    assert gaussian_nll(np.zeros(3), np.full(3, 2 * np.pi), 1.0) == pytest.approx(0)
+    assert uncertainty.gaussian_nll(errors, precision, 1.0) == pytest.approx(np.mean(by_hand))
+    assert uncertainty.gaussian_nll(np.zeros(3), np.full(3, 2 * np.pi), 1.0) == pytest.approx(0)
 
 
 def test_calibration_error_by_hand():
     # Levels 1/4 and 3/4: z is 0.3186 and 1.1503.
     errors = np.array([0.1, -0.3, 1.0, 5.0])
-    curve = reliability_curve(errors, np.ones(4), bins=2)
+    curve = uncertainty.reliability_curve(errors, np.ones(4), bins=2)
     assert curve.levels.tolist() == [0.25, 0.75]
     assert curve.shares.tolist() == [0.5, 0.75]
     assert calibration_error(errors, np.ones(4), bins=2) == pytest.approx(0.125)
     # Sigma ten times as large: 3.186 and 11.503.
-    assert reliability_curve(errors, np.full(4, 0.01), bins=2).shares.tolist() == [0.75, 1]
-    assert reliability_curve(errors, np.full(4, 0.01), 0.01, bins=2).shares.tolist() == [0.5, 0.75]
+    assert uncertainty.reliability_curve(errors, np.full(4, 0.01), bins=2).shares.tolist() == [0.75, 1]
+    assert uncertainty.reliability_curve(errors, np.full(4, 0.01), 0.01, bins=2).shares.tolist() == [0.5, 0.75]
     # Far too sure of itself: nothing is within, and the levels themselves are missed.
     assert calibration_error(errors, np.full(4, 1e12)) == pytest.approx(0.5)
     assert calibration_error(np.zeros(4), np.ones(4)) == pytest.approx(0.5)
@@ -75,8 +67,8 @@ def test_scores_by_hand_of_the_parts():
     assert scores.scale == pytest.approx((precision * errors**2).mean())
     assert scores.scale == pytest.approx(5, rel=0.3)
     assert scores.ause == pytest.approx(ause(errors, precision))
-    assert scores.nll == pytest.approx(gaussian_nll(errors, precision, 1))
-    assert scores.nll_calibrated == pytest.approx(gaussian_nll(errors, precision, scores.scale))
+    assert scores.nll == pytest.approx(uncertainty.gaussian_nll(errors, precision, 1))
+    assert scores.nll_calibrated == pytest.approx(uncertainty.gaussian_nll(errors, precision, scores.scale))
     assert scores.ece_calibrated == pytest.approx(calibration_error(errors, precision, scores.scale))
 
 
