@@ -88,7 +88,9 @@ def _read(folder: Path, name: str, part: slice, frames: FrameChoice) -> Labelled
     depths, unread = _of_one_kind(folder / "depth", _DEPTH_FILES)
     masks, unread_masks = _of_one_kind(folder / "mask", _MASK_FILES)
     found = [depths.get(path.stem) for path in taken]
-    depth, gaps, notes = map_reader("depth", taken, found, _read_depth, folder / "depth" / "*.png")
+    depth, gaps, notes = map_reader(
+        "depth", taken, found, lambda path: _DEPTH_FILES[path.suffix.lower()](path), folder / "depth" / "*.png"
+    )
     notes += unread + unread_masks + known.notes
     mask = None
     if masks:
@@ -140,10 +142,6 @@ def _of_one_kind(folder: Path, endings: Iterable[str]) -> tuple[dict[str, Path],
         else ""
     )
     return found, (note,) * bool(note)
-
-
-def _read_depth(path: Path) -> Float32[np.ndarray, "h w"]:
-    return _DEPTH_FILES[path.suffix.lower()](path)
 
 
 def _holds_pictures(folder: Path) -> bool:
