@@ -92,6 +92,13 @@ def unproject(
     return points.reshape(*frames, H, W, 3)
 
 
+def zoomed(intrinsics: Float[np.ndarray, "S 3 3"], factor: float) -> Float[np.ndarray, "S 3 3"]:
+    """Return intrinsics with focal lengths times a factor."""
+    changed = intrinsics.copy()
+    changed[:, [0, 1], [0, 1]] *= factor
+    return changed
+
+
 def project(
     points: Float[np.ndarray, "N 3"],
     camera_from_world: Float[np.ndarray, "3 4"],

@@ -6,7 +6,7 @@ Does not import jax.
 from __future__ import annotations
 
 import fnmatch
-import itertools
+import os
 import re
 from collections import Counter, defaultdict
 from collections.abc import Sequence
@@ -143,16 +143,10 @@ def _names(paths: Sequence[Path]) -> str:
     return ", ".join(path.name for path in paths[:_SHOWN]) + more
 
 
-def _common(texts: Sequence[str]) -> str:
-    """Return what all texts begin with."""
-    alike = itertools.takewhile(lambda letters: len(set(letters)) == 1, zip(*texts, strict=False))
-    return "".join(letters[0] for letters in alike)
-
-
 def _advice(frames: Sequence[Path], images: Sequence[Path]) -> str:
     """Return what to do: the pattern that only the frames match, where there is one."""
     names, folders = [path.name for path in frames], {path.parent for path in frames}
-    start, end = (_common(texts) for texts in (names, [name[::-1] for name in names]))
+    start, end = map(os.path.commonprefix, (names, [name[::-1] for name in names]))
     start = start.rstrip("0123456789.")
     end = end[: max(0, min(map(len, names)) - len(start))][::-1].lstrip("0123456789")
     pattern = f"{start}*{end}" if len(names) > 1 else f"*{frames[0].suffix}"

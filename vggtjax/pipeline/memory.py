@@ -21,7 +21,7 @@ from vggtjax.network.aggregator import SPECIAL_TOKENS
 from vggtjax.network.heads.dpt_head import HIDDEN, PIXELS_AT_ONCE
 from vggtjax.network.kernels.cpu_attention import LOGITS_OF_ALL_HEADS, chunk_count
 from vggtjax.network.kernels.gathered_attention import GATHERED_AT_ONCE
-from vggtjax.options import Method, find_method
+from vggtjax.options import find_method
 from vggtjax.storage.free_memory import Room, host_room
 
 ERROR = 0.15  # of a measured peak: predictions are as near
@@ -89,7 +89,9 @@ def predicted_bytes(
     held = frames if host else -(-frames // devices)  # every process loads the whole clip and returns all of it
     run = here * pass_bytes(model.config, frames, height, width, devices=devices, accelerator=not host) + held * picture
     if host:
-        run = _PROCESS + max(run, _COMPILING if _second_is_another(find_method(method)) else 0)
+        row = find_method(method)
+        second_is_another = row.needs_second_pass and "depth" not in row.second_outputs()  # program
+        run = _PROCESS + max(run, _COMPILING if second_is_another else 0)
     run = max(run, frames * picture)  # after a pass, every device reads all frames
     return here * model.parameter_bytes + run
 
@@ -159,11 +161,6 @@ def most_frames(
         fits = predicted_bytes(model, middle, height, width, accelerator=accelerator, **how) <= size
         low, high = (middle, high) if fits else (low, middle)
     return low
-
-
-def _second_is_another(method: Method) -> bool:
-    """Whether the second pass is another program than the first, as it gives no depth."""
-    return method.needs_second_pass and "depth" not in method.second_outputs()
 
 
 def on_cpu() -> bool:

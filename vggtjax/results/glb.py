@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -134,8 +134,8 @@ def _colors_of_gltf(buffers: dict[str, bytes], tree: dict[str, Any]) -> None:
     banded), and trimesh reads 16 bits wrongly, so they are float32. Without KHR_materials_unlit viewers light the
     frusta, which are black where there is no light.
     """
-    names = list(buffers)
-    for accessor in {number for mesh in tree["meshes"] for number in _colors_of(mesh)}:
+    names, parts = list(buffers), [part for mesh in tree["meshes"] for part in mesh["primitives"]]
+    for accessor in {part["attributes"]["COLOR_0"] for part in parts if "COLOR_0" in part["attributes"]}:
         entry = list(tree["accessors"].values())[accessor]
         name = names[entry["bufferView"]]
         colors = np.frombuffer(buffers[name], np.uint8).reshape(-1, 4)[: entry["count"], :3]
@@ -145,11 +145,5 @@ def _colors_of_gltf(buffers: dict[str, bytes], tree: dict[str, Any]) -> None:
             entry.pop(key, None)
     tree["materials"] = [_UNLIT]
     tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", ()), *_UNLIT["extensions"]})
-    for mesh in tree["meshes"]:
-        for primitive in mesh["primitives"]:
-            primitive["material"] = 0
-
-
-def _colors_of(mesh: dict[str, Any]) -> Iterator[int]:
-    """Yield the numbers of the accessors of a mesh's colours."""
-    return (part["attributes"]["COLOR_0"] for part in mesh["primitives"] if "COLOR_0" in part["attributes"])
+    for part in parts:
+        part["material"] = 0

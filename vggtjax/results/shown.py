@@ -97,8 +97,9 @@ def shown_points(
         thinning.add(Candidates(points.positions, places, confidence, points.frames, points.pixels))
         (progress or no_progress)(number + 1, count)
     kept = thinning.kept()
-    static = _no_points() if kept is None else ShownPoints(kept.positions, kept.frames, kept.pixels)
-    return static, moving
+    if kept is None:
+        return ShownPoints(np.zeros((0, 3), np.float32), np.zeros(0, np.int32), np.zeros(0, np.int32)), moving
+    return ShownPoints(kept.positions, kept.frames, kept.pixels), moving
 
 
 def middle_and_radius(result: Result) -> tuple[Float64[np.ndarray, " 3"], float]:
@@ -141,7 +142,3 @@ def on_edges(frame: ResultFrame, edges: float) -> Bool[np.ndarray, "h w"]:
 def _points(positions: Float32[np.ndarray, "P 3"], number: int, pixels: Bool[np.ndarray, "h w"]) -> ShownPoints:
     chosen = np.flatnonzero(pixels).astype(np.int32)
     return ShownPoints(positions[chosen], np.full(len(chosen), number, np.int32), chosen)
-
-
-def _no_points() -> ShownPoints:
-    return ShownPoints(np.zeros((0, 3), np.float32), np.zeros(0, np.int32), np.zeros(0, np.int32))

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 _KILO = 1024
 _NO_LIMIT = 1 << 60  # larger limits of version 1 stand for none
-_V1 = ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes", "total_inactive_file")
-_V2 = ("memory.max", "memory.current", "inactive_file")
+_V1 = ("sys/fs/cgroup/memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
+_V2 = ("sys/fs/cgroup", "memory.max", "memory.current", "inactive_file")
 _LATER = 300_000_000  # bytes of address space of threads that start later, without memory of their own
 _LIMITS = {"Max address space": ("VmSize", "ulimit -v"), "Max data size": ("VmData", "ulimit -d")}
 
@@ -42,12 +42,12 @@ def host_room(root: Path = Path("/")) -> Room | None:
 
 def total_bytes(root: Path = Path("/")) -> int | None:
     """Return the memory of the computer; None where the system does not tell."""
-    return _kilobytes(root / "proc/meminfo", "MemTotal")
+    return proc_bytes(root / "proc/meminfo", "MemTotal")
 
 
 def rooms(root: Path = Path("/")) -> list[Room]:
     """Return how large this process can get by each of the limits that there are."""
-    held = _kilobytes(root / "proc/self/status", "VmRSS") or 0
+    held = proc_bytes(root / "proc/self/status", "VmRSS") or 0
     return [room._replace(size=held + room.size) for room in _left(root)]
 
 
@@ -58,7 +58,7 @@ def free_bytes(root: Path = Path("/")) -> float | None:
 
 def _left(root: Path) -> list[Room]:
     """Return what each of the limits leaves beside what this process holds."""
-    available = _kilobytes(root / "proc/meminfo", "MemAvailable")
+    available = proc_bytes(root / "proc/meminfo", "MemAvailable")
     if available is None:
         return []
     left = [Room(available, "of the computer")]
@@ -69,15 +69,11 @@ def _left(root: Path) -> list[Room]:
 
 def own_limits(root: Path = Path("/")) -> list[tuple[str, int, int]]:
     """Return name, limit and present use of each limit that is set for this process, such as by `ulimit -v`."""
-    try:
-        lines = (root / "proc/self/limits").read_text().splitlines()
-    except OSError:
-        return []
     found = []
-    for line in lines:
+    for line in _lines(root / "proc/self/limits"):
         for title, (figure, name) in _LIMITS.items():
             soft = line.removeprefix(title).split()[0] if line.startswith(title) else "unlimited"
-            used = _kilobytes(root / "proc/self/status", figure)
+            used = proc_bytes(root / "proc/self/status", figure)
             if soft.isdecimal() and used is not None:
                 found.append((name, int(soft), used))
     return found
@@ -85,54 +81,47 @@ def own_limits(root: Path = Path("/")) -> list[tuple[str, int, int]]:
 
 def _group_rooms(root: Path) -> Iterator[int]:
     """Yield what is left to each control group of this process that has a limit."""
-    try:
-        lines = (root / "proc/self/cgroup").read_text().splitlines()
-    except OSError:
-        return
-    for line in lines:
+    for line in _lines(root / "proc/self/cgroup"):
         number, controllers, place = line.split(":", 2)
         if number != "0" and "memory" not in controllers.split(","):
             continue
-        limit_name, used_name, droppable_name = _V2 if number == "0" else _V1
+        groups, limit_name, used_name, droppable_name = _V2 if number == "0" else _V1
         group = Path(place.lstrip("/"))
         for part in (group, *group.parents):
-            base = root / "sys/fs/cgroup"
-            limit_file, used_file = (base / _inside(name, part) for name in (limit_name, used_name))
-            limit, used = _number(limit_file), _number(used_file)
+            folder = root / groups / part
+            limit, used = _number(folder / limit_name), _number(folder / used_name)
             if limit is None or used is None or limit >= _NO_LIMIT:
                 continue
-            yield max(0, limit - used + _droppable(used_file.with_name("memory.stat"), droppable_name))
-
-
-def _inside(name: str, group: Path) -> Path:
-    """Return where a file of a group lies below the folder of all groups: memory/GROUP/FILE or GROUP/FILE."""
-    *controller, file = Path(name).parts
-    return Path(*controller, group, file)
+            yield max(0, limit - used + _droppable(folder / "memory.stat", droppable_name))
 
 
 def _number(path: Path) -> int | None:
-    try:
-        text = path.read_text().strip()
-    except OSError:
-        return None
+    text = "".join(_lines(path)).strip()
     return int(text) if text.isdecimal() else None  # "max": no limit
 
 
 def _droppable(path: Path, name: str) -> int:
     try:
-        lines = dict(line.split() for line in path.read_text().splitlines())
-        return int(lines.get(name, 0))
-    except (OSError, ValueError):
+        return int(dict(line.split() for line in _lines(path)).get(name, 0))
+    except ValueError:
         return 0
 
 
-def _kilobytes(path: Path, name: str) -> int | None:
-    """Return a figure in kB of a file of /proc, in bytes."""
+def proc_bytes(path: Path, name: str) -> int | None:
+    """Return a figure in kB of a file of /proc, in bytes; None where there is none."""
     try:
-        lines = dict(line.split(":", 1) for line in path.read_text().splitlines() if ":" in line)
+        lines = dict(line.split(":", 1) for line in _lines(path) if ":" in line)
         return int(lines[name].split()[0]) * _KILO
-    except (OSError, LookupError, ValueError):
+    except (LookupError, ValueError):
         return None
+
+
+def _lines(path: Path) -> list[str]:
+    """Return the lines of a file of the system; none where it cannot be read."""
+    try:
+        return path.read_text().splitlines()
+    except OSError:
+        return []
 
 
 def return_freed_memory() -> None:

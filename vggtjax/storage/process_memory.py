@@ -5,17 +5,15 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+from vggtjax.storage.free_memory import proc_bytes
+
 _PROCESS = Path("/proc/self")
 _RESET_HIGH_WATER = "5"  # of clear_refs
 
 
 def process_bytes(name: str) -> int | None:
     """Return a figure of /proc/self/status, such as VmRSS, VmHWM or RssAnon, in bytes; None if not on Linux."""
-    try:
-        lines = dict(line.split(":", 1) for line in (_PROCESS / "status").read_text().splitlines())
-        return int(lines[name].split()[0]) * 1024
-    except (OSError, LookupError):
-        return None
+    return proc_bytes(_PROCESS / "status", name)
 
 
 def reset_high_water() -> int | None:

@@ -168,11 +168,6 @@ def _staged(folder: Path) -> Iterator[Path]:
             _release(lock)
 
 
-@lru_cache  # once in a process: a scan of 20,000 files takes as long as writing 50
-def _remove_leftovers(folder: Path) -> None:
-    remove_leftovers(folder)
-
-
 def remove_leftovers(folder: Path) -> None:
     """Remove what killed writers left in a folder: their locks are free, or they have no lock and are old."""
     for path in [Path(entry) for entry in os.scandir(folder) if _LEFTOVER.fullmatch(entry.name)]:
@@ -183,6 +178,9 @@ def remove_leftovers(folder: Path) -> None:
                     _release(lock)
             elif time.time() - path.lstat().st_mtime > _OLD and not path.with_suffix(".lock").exists():
                 shutil.rmtree(path)
+
+
+_remove_leftovers = lru_cache(remove_leftovers)  # once: a scan of 20,000 files takes as long as writing 50
 
 
 def _acquire(path: Path, wait: float = 0) -> FileLock | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
@@ -60,27 +60,24 @@ class VideoFile:
 
     def seconds(self) -> float | None:
         """Return the length that the file states, or None where it states none. Raises ClipError as `frames` does."""
-        import av
-        import av.error
-
-        try:
-            with _opened(self.path, av) as container:
-                stream = _video_stream(container, self.path, self._said)
-                if stream.duration is not None and stream.time_base is not None:
-                    return float(stream.duration * stream.time_base)
-                return None if container.duration is None else container.duration / 1e6
-        except (av.error.FFmpegError, OSError, EOFError) as error:
-            raise _unreadable(self.path, 0, error) from error
+        with self._content() as (container, stream):
+            if stream.duration is not None and stream.time_base is not None:
+                return float(stream.duration * stream.time_base)
+            return None if container.duration is None else container.duration / 1e6
 
     def tags(self) -> dict[str, str]:
         """Return what the file and its video stream say of themselves. Raises ClipError as `frames` does."""
+        with self._content() as (container, stream):
+            return {**container.metadata, **stream.metadata}
+
+    @contextmanager
+    def _content(self) -> Iterator[tuple[InputContainer, VideoStream]]:
         import av
         import av.error
 
         try:
             with _opened(self.path, av) as container:
-                stream = _video_stream(container, self.path, self._said)
-                return {**container.metadata, **stream.metadata}
+                yield container, _video_stream(container, self.path, self._said)
         except (av.error.FFmpegError, OSError, EOFError) as error:
             raise _unreadable(self.path, 0, error) from error
 

@@ -56,7 +56,7 @@ def app(
             for name in reversed(runner.names):  # the default last; broken weights are met before the first job
                 with report.stage(f"load {name}") as progress:
                     runner.model(name, progress)
-    signal.signal(signal.SIGTERM, _interrupt)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl+C
     with tempfile.TemporaryDirectory(prefix="vggtjax-app-", ignore_cleanup_errors=True) as folder:
         os.environ.update(_SETTINGS | {"GRADIO_TEMP_DIR": folder})  # before the import, where gradio reads them
         from vggtjax.interface.app.page import USER, serve
@@ -65,7 +65,3 @@ def app(
         opening = f"Open {Access(host, port, None).url}{sign_in}  (Ctrl+C ends the app)"
         serve(runner, Path(folder), host, port, password, lambda: report.line(opening))
     handled()
-
-
-def _interrupt(*_: object) -> None:
-    raise KeyboardInterrupt

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 from vggtjax.clips.preprocessing import Framing
-from vggtjax.interface.commands.flags import Switch
+from vggtjax.interface.commands.flags import InWords, Switch
 from vggtjax.options import Options
 
 _SOURCES = tyro.conf.arg(metavar="SOURCE [SOURCE ...]", help_behavior_hint="(required)")
@@ -27,58 +27,38 @@ CONSISTENT = Options(consistent_depth=True)
 """What the commands `reconstruct` and `batch` do unless told otherwise; functions keep to the papers."""
 
 
-def _result_folder(out: Path) -> Path:
-    """Return the folder.
+_RESULT = "folder for the result; an earlier result in it is replaced as a whole"
+_BATCH = "folder for the results, or a URL such as s3://bucket/results, with one folder per clip, named after it"
+_EVALUATION = "folder for results.json, results.csv, table.md, table.tex and index.html"
+_VIEW = "open the viewer at the end; vggtjax view has its options"
+_SHOTS = (
+    "keep a clip with cuts as one clip, or split it: each shot gets a result of its own, in OUT/shot_1 and on,\n"
+    "without flashes and frames of one colour"
+)
+_SHARD = "take every N-th clip, from the K-th on: runs for K from 1 to N do the batch together, in one folder"
 
-    Args:
-        out: folder for the result; an earlier result in it is replaced as a whole
-    """
+
+def _result_folder(out: Annotated[Path, tyro.conf.arg(help=_RESULT)]) -> Path:
     return out
 
 
-def _batch_folder(out: Annotated[str, tyro.conf.arg(metavar="FOLDER|URL")]) -> str:
-    """Return the folder.
-
-    Args:
-        out: folder for the results, or a URL such as s3://bucket/results, with one folder per clip, named after it
-    """
+def _batch_folder(out: Annotated[str, tyro.conf.arg(help=_BATCH, metavar="FOLDER|URL")]) -> str:
     return out
 
 
-def _evaluation_folder(out: Path) -> Path:
-    """Return the folder.
-
-    Args:
-        out: folder for results.json, results.csv, table.md, table.tex and index.html
-    """
+def _evaluation_folder(out: Annotated[Path, tyro.conf.arg(help=_EVALUATION)]) -> Path:
     return out
 
 
-def _view(view: Switch = False) -> bool:
-    """Return the choice.
-
-    Args:
-        view: open the viewer at the end; vggtjax view has its options
-    """
+def _view(view: Annotated[Switch, tyro.conf.arg(help=_VIEW)] = False) -> bool:
     return view
 
 
-def _shots(shots: Literal["keep", "split"] = "keep") -> str:
-    """Return the choice.
-
-    Args:
-        shots: keep a clip with cuts as one clip, or split it: each shot gets a result of its own, in OUT/shot_1 and on,
-            without flashes and frames of one colour
-    """
+def _shots(shots: Annotated[Literal["keep", "split"], tyro.conf.arg(help=_SHOTS)] = "keep") -> str:
     return shots
 
 
-def _shard(shard: Annotated[str | None, tyro.conf.arg(metavar="K/N", help_behavior_hint="")] = None) -> str | None:
-    """Return the choice.
-
-    Args:
-        shard: take every N-th clip, from the K-th on: runs for K from 1 to N do the batch together, in one folder
-    """
+def _shard(shard: Annotated[InWords[str | None], tyro.conf.arg(help=_SHARD, metavar="K/N")] = None) -> str | None:
     return shard
 
 

@@ -115,15 +115,9 @@ def _longest_clips() -> Iterator[dict[str, Any]]:
 
     room = memory.available()  # no model is loaded
     for name, model in _known_models():
-        config = model.config
-        width, height = Framing().fitter(config).fit(*_WIDE, "").frame_size
-        yield {
-            "model": name,
-            "weights": model.parameter_bytes,
-            "width": width,
-            "height": height,
-            "frames": None if room is None else memory.most_frames(model, height, width, room.size),
-        }
+        width, height = Framing().fitter(model.config).fit(*_WIDE, "").frame_size
+        frames = None if room is None else memory.most_frames(model, height, width, room.size)
+        yield _clip(name, model.parameter_bytes, width, height, frames)
 
 
 def _longest_on(gpu: str) -> Iterator[dict[str, Any]]:
@@ -140,13 +134,12 @@ def _longest_on(gpu: str) -> Iterator[dict[str, Any]]:
     size = sum(prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(shapes))
     model, room = Planned(vggt_1b(), size), memory.room_of_gpu(gpu)
     for shape, (width, height) in _SHAPES.items():
-        yield {
-            "model": f"VGGT-1B on {gpu}, {shape}",
-            "weights": size,
-            "width": width,
-            "height": height,
-            "frames": memory.most_frames(model, height, width, room.size, accelerator=True),
-        }
+        frames = memory.most_frames(model, height, width, room.size, accelerator=True)
+        yield _clip(f"VGGT-1B on {gpu}, {shape}", size, width, height, frames)
+
+
+def _clip(model: str, weights: int, width: int, height: int, frames: int | None) -> dict[str, Any]:
+    return {"model": model, "weights": weights, "width": width, "height": height, "frames": frames}
 
 
 def _known_models() -> Iterator[tuple[str, Any]]:

@@ -59,51 +59,39 @@ def _refine_mask(refine_mask: Switch = False, no_refine_mask: Switch = False) ->
     return True if refine_mask else False if no_refine_mask else None
 
 
-def _devices(devices: Annotated[int, tyro.conf.arg(help_behavior_hint="(default: 1)")] = 1) -> int:
-    """Return the number.
+_DEVICES = "share the frames of a clip among so many devices, each with a copy of the weights"
+_NO_MEMORY_CHECK = "run all frames together, without comparing the memory that they need with what is free"
+_UNDISTORT = (
+    "make frames of a capture with coefficients of its lens those of a pinhole camera (the default), or\n"
+    "leave them as they are and ignore the coefficients"
+)
+_PAD_FRAMES = (
+    "pad clips to one of a few lengths, so that clips of similar length share compiled programs; for many\n"
+    "lengths on a GPU, where compiling takes longer than running"
+)
+_MASKS = (
+    "folder with a folder of pictures for each clip, named like it, as --masks of vggtjax reconstruct takes\n"
+    "them; masks of other clips are mined"
+)
 
-    Args:
-        devices: share the frames of a clip among so many devices, each with a copy of the weights
-    """
+
+def _devices(devices: Annotated[int, tyro.conf.arg(help=_DEVICES, help_behavior_hint="(default: 1)")] = 1) -> int:
     return devices
 
 
-def _no_memory_check(no_memory_check: Switch = False) -> bool:
-    """Return the choice.
-
-    Args:
-        no_memory_check: run all frames together, without comparing the memory that they need with what is free
-    """
+def _no_memory_check(no_memory_check: Annotated[Switch, tyro.conf.arg(help=_NO_MEMORY_CHECK)] = False) -> bool:
     return no_memory_check
 
 
-def _undistort(undistort: Annotated[bool, tyro.conf.arg(help_behavior_hint="")] = True) -> bool:
-    """Return whether frames are undistorted.
-
-    Args:
-        undistort: make frames of a capture with coefficients of its lens those of a pinhole camera (the default), or
-            leave them as they are and ignore the coefficients
-    """
+def _undistort(undistort: Annotated[InWords[bool], tyro.conf.arg(help=_UNDISTORT)] = True) -> bool:
     return undistort
 
 
-def _pad_frames(pad_frames: Switch = False) -> bool:
-    """Return the choice.
-
-    Args:
-        pad_frames: pad clips to one of a few lengths, so that clips of similar length share compiled programs; for many
-            lengths on a GPU, where compiling takes longer than running
-    """
+def _pad_frames(pad_frames: Annotated[Switch, tyro.conf.arg(help=_PAD_FRAMES)] = False) -> bool:
     return pad_frames
 
 
-def _masks(masks: InWords[Path | None] = None) -> Path | None:
-    """Return the folder.
-
-    Args:
-        masks: folder with a folder of pictures for each clip, named like it, as --masks of vggtjax reconstruct takes
-            them; masks of other clips are mined
-    """
+def _masks(masks: Annotated[InWords[Path | None], tyro.conf.arg(help=_MASKS)] = None) -> Path | None:
     return masks
 
 

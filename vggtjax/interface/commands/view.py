@@ -91,7 +91,10 @@ def view(
                 progress(number + 1, len(results))
         names = _names(results)
         if export is not None:
-            _export(report, loaded, names, export)
+            with report.stage("choose points") as progress:
+                from vggtjax.results.viewer.page import Viewer, viewer_page
+
+                Viewer(viewer_page(loaded, names=names, progress=progress)).save(export)
     if export is not None:
         report.line(f"Open in a browser: {export}")
     else:
@@ -120,13 +123,6 @@ def serve(report: Report, results: Sequence[Result], names: Sequence[str], servi
         except KeyboardInterrupt:
             handled()
             report.line("The viewer has ended.")
-
-
-def _export(report: Report, results: Sequence[Result], names: Sequence[str], path: Path) -> None:
-    with report.stage("choose points") as progress:
-        from vggtjax.results.viewer.page import Viewer, viewer_page
-
-        Viewer(viewer_page(results, names=names, progress=progress)).save(path)
 
 
 def _names(paths: Sequence[Path]) -> list[str]:

@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from vggtjax.cameras import world_from_camera
+from vggtjax.cameras import world_from_camera, zoomed
 from vggtjax.pipeline.known.consistency import consistent_with_poses
 from vggtjax.pipeline.known.depths import captured_depths, sampled_depths
 from vggtjax.pipeline.known.given import Given
@@ -99,8 +99,7 @@ def _with_poses(result: R, given: Given, notes: dict[str, str]) -> tuple[R, floa
         result, depth=result.depth * np.float32(found.scale), camera_from_world=poses.astype(np.float32)
     )
     made = consistent_with_poses(posed, focal_known=given.intrinsics is not None)
-    intrinsics, depth = posed.intrinsics.copy(), posed.depth * made.depth.astype(np.float32)
-    intrinsics[:, [0, 1], [0, 1]] *= np.float32(made.focal)
+    intrinsics, depth = zoomed(posed.intrinsics, made.focal), posed.depth * made.depth.astype(np.float32)
     notes["depth by poses"] = (
         f"changed by {np.abs(np.log(made.depth)).mean():.1%} on average, so that the correlation between frames goes "
         f"from {1 - made.cost[0]:.2f} to {1 - made.cost[1]:.2f}"

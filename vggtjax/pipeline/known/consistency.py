@@ -8,6 +8,7 @@ import numpy as np
 import scipy
 from jaxtyping import Bool, Float, Float64
 
+from vggtjax.cameras import zoomed
 from vggtjax.pipeline.known.sweep import Views, sweep_costs
 from vggtjax.results.result import Result
 
@@ -47,7 +48,7 @@ def consistent_with_poses(result: Result, *, focal_known: bool) -> Consistent:
     before = _mean(_regional(views, np.zeros(1))[:, 0], views.usable)
     scale = _one_scale(small)
     focal = 1.0 if focal_known else _focal(small._replace(depth=small.depth * scale))
-    views = views._replace(depth=views.depth * scale, intrinsics=_with_focal(views.intrinsics, focal))
+    views = views._replace(depth=views.depth * scale, intrinsics=zoomed(views.intrinsics, focal))
     logarithms, after = _fields(views)
     enlarged = np.stack([_enlarged(field, step, (height, width)) for field in logarithms])
     return Consistent(focal, scale * np.exp(enlarged), (before, after))
@@ -67,7 +68,7 @@ def _focal(views: Views) -> float:
     """Return the factor of the focal lengths with the least cost at the best factor of every region's depth."""
     costs = []
     for logarithm in _FOCALS:
-        changed = views._replace(intrinsics=_with_focal(views.intrinsics, float(np.exp(logarithm))))
+        changed = views._replace(intrinsics=zoomed(views.intrinsics, float(np.exp(logarithm))))
         costs.append(_mean(_regional(changed, _FEW).min(axis=1), views.usable))
     best = int(np.argmin(costs))
     if costs[best] > (1 - _LEAST_FOCAL_GAIN) * costs[len(_FOCALS) // 2]:
@@ -111,12 +112,6 @@ def _lowest(costs: Float[np.ndarray, "S F H W"], logarithms: Float[np.ndarray, "
 
 def _mean(values: Float[np.ndarray, "S H W"], usable: Bool[np.ndarray, "S H W"]) -> float:
     return float(values[usable].mean()) if usable.any() else 0.0
-
-
-def _with_focal(intrinsics: Float[np.ndarray, "S 3 3"], factor: float) -> Float[np.ndarray, "S 3 3"]:
-    changed = intrinsics.copy()
-    changed[:, [0, 1], [0, 1]] *= factor
-    return changed
 
 
 def _pooled(result: Result, step: int) -> Views:

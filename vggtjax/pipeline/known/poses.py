@@ -198,10 +198,8 @@ def _residual(found: PoseAgreement) -> float:
 def _in_order(known: Float64[np.ndarray, "S 3 4"], order: list[int]) -> Float64[np.ndarray, "S 3 4"]:
     """Return poses with the numbers of their quaternions x y z w taken in another order, at the same places."""
     turns = scipy.spatial.transform.Rotation.from_matrix(known[:, :, :3]).inv().as_quat()[:, order]
-    poses = np.tile(np.eye(4), (len(known), 1, 1))
-    poses[:, :3, :3] = scipy.spatial.transform.Rotation.from_quat(turns).as_matrix()
-    poses[:, :3, 3] = camera_centres(known)
-    return world_from_camera(poses[:, :3])[:, :3]
+    rotations = scipy.spatial.transform.Rotation.from_quat(turns).as_matrix()
+    return world_from_camera(np.concatenate([rotations, camera_centres(known)[:, :, None]], axis=2))[:, :3]
 
 
 def _times(clip: Clip | Result) -> list[Float64[np.ndarray, " S"]]:

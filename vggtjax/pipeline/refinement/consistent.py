@@ -20,6 +20,7 @@ import numpy as np
 import scipy
 from jaxtyping import Float32, UInt8
 
+from vggtjax.cameras import zoomed
 from vggtjax.network.surroundings import own_settings
 from vggtjax.pipeline.known.intrinsics import shared_focal
 from vggtjax.pipeline.refinement.cells import Cells, cells_of, grey_pictures
@@ -112,7 +113,9 @@ def consistent_depth(
         counted = "1 frame" if frames == 1 else f"{frames} frames"
         reason = f"the clip has {counted}; {FEWEST_FRAMES} to {MOST_FRAMES} are adjusted together"
         return _kept(result, reason, warns=frames > MOST_FRAMES)
-    start = result if priors.focal is None else _with_one_focal_length(result)
+    start = result
+    if priors.focal is not None:  # one focal length: errors of single ones would hold other cameras in wrong places
+        start = dataclasses.replace(result, intrinsics=shared_focal(result).astype(np.float32))
     cells = cells_of(start)
     if (share := cells.is_static.mean()) < _FEWEST_MATCHED:
         return _kept(
@@ -127,8 +130,9 @@ def consistent_depth(
         text = f"matched pixels tell the depth of {known.mean():.1%} of the picture; at least {_FEWEST_MATCHED:.0%} are"
         return _kept(result, text + " needed (texture, and a camera that moves)")
     measured = _measured(cells, world)
-    field = field or FieldPrior.of_error(world.error)
-    fields = fit_field(measured if points is None else joined_to(measured, points), frames, size, field)
+    if points is not None:
+        measured = Measured(*map(np.concatenate, zip(measured, points, strict=True)))
+    fields = fit_field(measured, frames, size, field or FieldPrior.of_error(world.error))
     before = differences(result, step)
     made, change = _by_field(start, world, fields, step)
     after, most = differences(made, step), _MOST_WORSE
@@ -153,11 +157,6 @@ def _agree(before: Float32[np.ndarray, " N"], after: Float32[np.ndarray, " M"], 
     return len(after) > 0 and bool(np.median(after) <= most * np.median(before))
 
 
-def joined_to(first: Measured, second: Measured) -> Measured:
-    """Return the measurements of both."""
-    return Measured(*(np.concatenate(values) for values in zip(first, second, strict=True)))
-
-
 def _measured(cells: Cells, world: DenseWorld) -> Measured:
     """Return the depths of cells over the result's, by the matches alone."""
     S, P = world.depth.shape
@@ -171,11 +170,6 @@ def _measured(cells: Cells, world: DenseWorld) -> Measured:
         information / (1 + information / _BEST),
     )
     return measured.of(information > 0)
-
-
-def _with_one_focal_length(result: R) -> R:
-    """Return the result with one focal length: errors of single ones would hold other cameras in wrong places."""
-    return dataclasses.replace(result, intrinsics=shared_focal(result).astype(np.float32))
 
 
 def _turned(result: Result, world: DenseWorld) -> float:
@@ -195,9 +189,7 @@ def _by_field(result: R, world: DenseWorld, fields: np.ndarray, step: Callable[[
         depth[frame] = result.depth[frame] * np.exp(logs)
         change.append(np.abs(logs).mean())
         step()
-    intrinsics = result.intrinsics.copy()
-    intrinsics[:, [0, 1], [0, 1]] *= np.float32(world.focal)
-    poses = world.camera_from_world.astype(np.float32)
+    intrinsics, poses = zoomed(result.intrinsics, world.focal), world.camera_from_world.astype(np.float32)
     made = dataclasses.replace(result, depth=depth, camera_from_world=poses, intrinsics=intrinsics)
     return made, float(np.mean(change))
 

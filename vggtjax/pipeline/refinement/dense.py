@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Float32, Float64, UInt8
 
-from vggtjax.cameras import Cameras
+from vggtjax.cameras import Cameras, zoomed
 from vggtjax.method.matching.adjustment import Adjustment, Static, adjust
 from vggtjax.method.matching.matches import frame_pairs
 from vggtjax.pipeline.refinement.cells import Cells, at_scale
@@ -111,7 +111,7 @@ def adjust_to_pixels(
     poses, K = cells.cameras.camera_from_world.astype(np.float32), cells.cameras.intrinsics.astype(np.float32)
     depth, factor, world = cells.depth, 1.0, None
     for each in rounds:
-        cameras = Cameras(poses, _zoomed(K, factor))
+        cameras = Cameras(poses, zoomed(K, factor))
         expected, warp = expected_matches(depth, cameras, cells.grid)
         pictures = at_scale(grey, cells.grid, each.pixels)
         found = match_pixels(pictures, expected, warp, cells.grid, each.window)
@@ -125,7 +125,7 @@ def adjust_to_pixels(
         with np.errstate(over="ignore"):
             measured = np.clip(depth * np.exp(made.pull), *_DEPTHS)
         error = _error(cells.depth, measured, made.information)
-        parallax = _parallax(depth, Cameras(poses, _zoomed(K, factor)), cells.grid)
+        parallax = _parallax(depth, Cameras(poses, zoomed(K, factor)), cells.grid)
         zoom = _zoom(found.position, weight, made.position, each.sigma, cells.grid)
         world = DenseWorld(poses.astype(np.float64), factor, measured, made.information, error, parallax, zoom)
         on_round()
@@ -169,10 +169,3 @@ def _error(
     if len(ratio) < _FEWEST_SURE:
         return _ERRORS[0]
     return float(np.clip(np.median(np.abs(ratio - np.median(ratio))) / 0.6745, *_ERRORS))
-
-
-def _zoomed(intrinsics: Float32[np.ndarray, "S 3 3"], factor: float) -> Float32[np.ndarray, "S 3 3"]:
-    """Return intrinsics with focal lengths times a factor."""
-    K = intrinsics.copy()
-    K[:, [0, 1], [0, 1]] *= np.float32(factor)
-    return K

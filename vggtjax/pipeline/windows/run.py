@@ -145,11 +145,6 @@ def reconstruct_long(
     return run_windows(source, Path(out), windows, plan, tools, settings, consistent=consistent)
 
 
-def _stopped(store: WindowStore, windows: int) -> str:
-    """Return what an interruption says."""
-    return f"{store.count()} of {windows} windows are kept; the same command goes on from there"
-
-
 def tools_of(
     model: Model,
     options: Options = Options(),
@@ -247,7 +242,10 @@ def run_windows(
         clip, seen = first, SeenFrames()
         if before := store.count():
             logger.info("%d of %d windows are kept from a run that was stopped", before, len(cut))
-        stopped = partial(_stopped, store, len(cut))
+
+        def stopped() -> str:
+            return f"{store.count()} of {len(cut)} windows are kept; the same command goes on from there"
+
         with kept(stopped), seconds.stage("windows"), plan.on_stage("windows") as progress:
             for number, clip in enumerate(chain([first], clips)):
                 seen.add(clip, cut[number])

@@ -103,16 +103,14 @@ def follow_points(
         if fresh := of_home.get(number + 1):
             points = np.flatnonzero(homes == number + 1)
             if neighbour is not None:
-                points, fresh = np.concatenate([neighbour.points, points]), _beside(neighbour.tracked, fresh)
+                points = np.concatenate([neighbour.points, points])
+                pairs = zip(neighbour.tracked, fresh, strict=True)
+                fresh = Tracked(*(np.concatenate(pair, axis=1) for pair in pairs))
             neighbour = _Neighbour(windows[number + 1], points, fresh)
         neighbour = run(number, nobody, neighbour)
     for positions, weight in zip(into.positions, weights, strict=True):
         positions /= weight[:, None]
     into.positions[queries.frames, np.arange(len(homes))] = queries.points
-
-
-def _beside(first: Tracked, second: Tracked) -> Tracked:
-    return Tracked(*(np.concatenate(pair, axis=1) for pair in zip(first, second, strict=True)))
 
 
 def _home(frame: int, windows: Sequence[range]) -> int:

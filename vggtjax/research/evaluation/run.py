@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,7 +12,7 @@ import numpy as np
 
 from vggtjax.clips.captures.capture import OtherShapeError
 from vggtjax.errors import VggtjaxError, one_line, reading
-from vggtjax.progress import OnStage, no_progress
+from vggtjax.progress import OnStage, StageSeconds, no_progress
 from vggtjax.research.evaluation.datasets.sequence import LabelledSequence, LeftOut, left_out
 from vggtjax.research.evaluation.metrics.depth import Align
 from vggtjax.research.evaluation.metrics.masks import Empty
@@ -100,18 +98,11 @@ def _computed(
     truth = None
     for group in source.groups:
         names = [name for name in group if name in drafts]
-        seconds: dict[str, float] = {}
-
-        @contextmanager
-        def timed(stage: str, seconds: dict[str, float] = seconds) -> Iterator[None]:
-            started = time.perf_counter()
-            yield None
-            seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - started
-
+        timed = StageSeconds()
         results: Mapping[str, Reconstruction] = {}
         problem = None
         try:
-            results = source.results(names, sequence, timed) if names else {}
+            results = source.results(names, sequence, timed.stage) if names else {}
         except Exception as error:
             problem = error
         for name in names:
@@ -140,7 +131,7 @@ def _computed(
                 reason=one_line("; ".join(problems), _MOST_LETTERS),
                 frames=len(own),
                 left_out=drafts[name].left_out | _left_out(lacking),
-                seconds=seconds,
+                seconds=timed.seconds,
             )
             yield record, scores.curves
 

@@ -39,7 +39,9 @@ def model_facts(
     """Return what was checked, on what, how fast, and in how much memory; `converted` is the file that was checked."""
     S, H, W = frames.images.shape[:3]
     devices = jax.local_devices()
-    times, peaks, versions = [f"vggtjax {own_seconds:.2f} s"], [f"vggtjax {_gigabytes(peak_bytes())}"], _versions()
+    times, peaks = [f"vggtjax {own_seconds:.2f} s"], [f"vggtjax {_gigabytes(peak_bytes())}"]
+    versions = [f"Python {platform.python_version()}"]
+    versions += [f"{name} {version(name)}" for name in ("vggtjax", "jax", "flax")]
     device = f"vggtjax {devices[0].device_kind}"
     if public is not None:
         times.append(f"public code {public.seconds:.2f} s")
@@ -72,10 +74,6 @@ def _sources(model: Model, converted: Path | None) -> Mapping[str, str]:
 def _digest(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _versions() -> list[str]:
-    return [f"Python {platform.python_version()}", *(f"{name} {version(name)}" for name in ("vggtjax", "jax", "flax"))]
 
 
 def _gigabytes(size: int | None) -> str:

@@ -79,17 +79,16 @@ def write_dynamic_splats(
         )
     count = {"count": len(ids), "num_exemplars": len(trained)}
     _dump(folder / "dataset.json", count | {"ids": ids, "train_ids": trained, "val_ids": tested})
-    facts = zip(ids, shares.tolist(), strict=True)
-    _dump(folder / "metadata.json", {name: _metadata(number, share) for number, (name, share) in enumerate(facts)})
+    facts = {
+        name: {"warp_id": number, "appearance_id": number, "camera_id": 0, "time_id": number, "time": share}
+        for number, (name, share) in enumerate(zip(ids, shares.tolist(), strict=True))
+    }
+    _dump(folder / "metadata.json", facts)
     splits = {"train_filenames": trained, "val_filenames": tested, "test_filenames": tested}
     named = {key: [f"rgb/1x/{name}.png" for name in names] for key, names in splits.items()}
     scene = {"camera_model": "OPENCV", "ply_file_path": _POINTS, **named, "frames": frames}
     _dump(folder / "transforms.json", scene)
     _write_scene(folder, result, static, np.array(ends), np.mean(ups, axis=0))
-
-
-def _metadata(number: int, share: float) -> dict[str, Any]:
-    return {"warp_id": number, "appearance_id": number, "camera_id": 0, "time_id": number, "time": share}
 
 
 def _write_frame(folder: Path, name: str, view: View) -> None:

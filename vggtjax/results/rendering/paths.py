@@ -48,21 +48,15 @@ def orbit(cameras: Cameras, intrinsics: Float[np.ndarray, "3 3"], depth: float, 
     yaw, pitch = SWING * np.sin(turns), -_LIFT - NOD * np.sin(2 * turns + np.pi / 2)
     angles = np.stack([yaw, pitch], axis=-1)
     swing = scipy.spatial.transform.Rotation.from_euler("yx", angles, degrees=True).as_matrix()
-    poses = np.tile(np.eye(4), (count, 1, 1))
-    poses[:, :3, :3] = start[:3, :3] @ swing
+    rotations = start[:3, :3] @ swing
     pivot = start[:3, 3] + depth * start[:3, 2]
-    poses[:, :3, 3] = pivot - (1 + _BACK) * depth * poses[:, :3, 2]
-    return Cameras(world_from_camera(poses[:, :3])[:, :3], np.tile(intrinsics, (count, 1, 1)))
+    return _placed(rotations, pivot - (1 + _BACK) * depth * rotations[:, :, 2], intrinsics)
 
 
 def follow(cameras: Cameras, intrinsics: Float[np.ndarray, "3 3"], depth: float, count: int) -> Cameras:
     """Follow the real cameras from the first to the last, smoothed and a little behind them.
 
-    Args:
-        cameras: the real ones, in the order of time.
-        intrinsics: of the virtual ones.
-        depth: of the scene's middle, in the middle camera.
-        count: of virtual cameras.
+    Arguments as for `orbit`; the real cameras are in the order of time.
     """
     real = world_from_camera(np.asarray(cameras.camera_from_world, np.float64))
     frames = len(real)
@@ -80,7 +74,9 @@ def follow(cameras: Cameras, intrinsics: Float[np.ndarray, "3 3"], depth: float,
         )
         # The nearest rotation of a mean of matrices.
         rotations = scipy.spatial.transform.Rotation.from_matrix(rotations).as_matrix()
-    poses = np.tile(np.eye(4), (count, 1, 1))
-    poses[:, :3, :3] = rotations
-    poses[:, :3, 3] = centres - _FOLLOW_BACK * depth * rotations[:, :, 2]
-    return Cameras(world_from_camera(poses[:, :3])[:, :3], np.tile(intrinsics, (count, 1, 1)))
+    return _placed(rotations, centres - _FOLLOW_BACK * depth * rotations[:, :, 2], intrinsics)
+
+
+def _placed(rotations: np.ndarray, centres: np.ndarray, intrinsics: Float[np.ndarray, "3 3"]) -> Cameras:
+    poses = np.concatenate([rotations, centres[:, :, None]], axis=2)  # world-from-camera
+    return Cameras(world_from_camera(poses)[:, :3], np.tile(intrinsics, (len(poses), 1, 1)))

@@ -110,10 +110,6 @@ def _motion(result: Result, points: ShownPoints) -> UInt8[np.ndarray, " N"]:
     return _levels(_of_patches(result.motion, points, *result.depth.shape[1:]), 1, MOST_MOTION)
 
 
-def _objects(result: Result, points: ShownPoints) -> UInt8[np.ndarray, " N"]:
-    return moving_ids(points.values(result.dynamic_mask), points.values(result.instances))
-
-
 def _object_names(result: Result) -> dict[str, Any]:
     objects = range(1, min(int(result.instances.max()), _MOST_NAMES) + 1)
     return {"names": [(0, "static"), *((number, f"object {number}") for number in objects)]}
@@ -178,7 +174,7 @@ _MODES = (
     ColorMode(
         "object",
         lambda result: _has_mask(result) and bool(result.instances.any()),
-        _objects,
+        lambda result, points: moving_ids(points.values(result.dynamic_mask), points.values(result.instances)),
         np.concatenate([np.array([_GREY], np.uint8), INSTANCE_COLORS[1:]]),
         _object_names,
     ),

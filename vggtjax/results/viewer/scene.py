@@ -150,13 +150,9 @@ def _steps(result: Result, points: ShownPoints) -> UInt8[np.ndarray, " N"]:
     bounds = np.searchsorted(points.frames[order], np.arange(len(result.depth) + 1))
     for number, (first, end) in enumerate(itertools.pairwise(bounds.tolist())):
         chosen = order[first:end]
-        steps[chosen] = _frame_steps(result, number).ravel()[points.pixels[chosen]]
+        of_points = relative_steps(frame_of(result, number)).ravel()[points.pixels[chosen]]
+        steps[chosen] = (np.clip(of_points / LARGEST_STEP, 0, 1) * 255).round().astype(np.uint8)
     return steps
-
-
-def _frame_steps(result: Result, number: int) -> UInt8[np.ndarray, "H W"]:
-    steps = relative_steps(frame_of(result, number))
-    return (np.clip(steps / LARGEST_STEP, 0, 1) * 255).round().astype(np.uint8)
 
 
 def _cameras(result: Result, place: Place) -> dict[str, Any]:

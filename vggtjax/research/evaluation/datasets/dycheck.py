@@ -38,8 +38,8 @@ from vggtjax.research.evaluation.datasets.sequence import (
     LabelledSequence,
     LeftOut,
     Opener,
-    depth_reader,
     left_out,
+    map_reader,
 )
 from vggtjax.storage.json_values import read_json
 
@@ -81,7 +81,9 @@ def _read(folder: Path, name: str, gt: str, frames: FrameChoice) -> LabelledSequ
     maps_folder = folder / (_ALIGNED if easi3r else _LIDAR)
     maps = files(maps_folder, ".npy")
     read = _from_disparity([maps[frame] for frame in names if frame in maps]) if easi3r else read_npy
-    depth, more, notes = depth_reader(pictures, [maps.get(frame) for frame in chosen], read, maps_folder / "*.npy")
+    depth, more, notes = map_reader(
+        "depth", pictures, [maps.get(frame) for frame in chosen], read, maps_folder / "*.npy"
+    )
     return LabelledSequence(
         name,
         tuple(pictures),

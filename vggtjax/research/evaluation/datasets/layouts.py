@@ -45,9 +45,8 @@ from vggtjax.research.evaluation.datasets.sequence import (
     FrameChoice,
     LabelledSequence,
     Opener,
-    depth_reader,
     left_out,
-    mask_reader,
+    map_reader,
     read_labels,
     unpictured,
 )
@@ -69,7 +68,7 @@ def _read_davis(root: Path, name: str, frames: FrameChoice) -> LabelledSequence:
     every, labels = _pictures(source, ".jpg"), files(folder, ".png")
     pictures = frames.of(every, name)
     paths = [labels.get(path.stem) for path in pictures]
-    mask, missing, notes = mask_reader(pictures, paths, read_labels, folder / "*.png")
+    mask, missing, notes = map_reader("masks", pictures, paths, read_labels, folder / "*.png")
     missing += unpictured(frames, (path.stem for path in every), labels, source)
     return LabelledSequence(name, tuple(pictures), mask=mask, notes=notes, left_out=missing)
 
@@ -110,7 +109,7 @@ def _read_sintel(training: Path, name: str, frames: FrameChoice) -> LabelledSequ
     source = training / "camdata_left" / name
     depths, cams = files(training / "depth" / name, ".dpt"), files(source, ".cam")
     expected = training / "depth" / name / "*.dpt"
-    depth, gaps, notes = depth_reader(pictures, [depths.get(path.stem) for path in pictures], read_dpt, expected)
+    depth, gaps, notes = map_reader("depth", pictures, [depths.get(path.stem) for path in pictures], read_dpt, expected)
     gaps += unpictured(frames, (path.stem for path in every), {*depths, *cams}, training / "final" / name)
     poses = intrinsics = None
     cameras = [read_cam(cams[path.stem]) if path.stem in cams else None for path in pictures]
@@ -155,7 +154,9 @@ def _read_seven_scenes(folder: Path, name: str, frames: FrameChoice) -> Labelled
     chosen = frames.of(list(pictures), name)
     taken = [pictures[frame] for frame in chosen]
     read = partial(read_png, per_metre=_MILLIMETRES, invalid=_INVALID)
-    depth, gaps, notes = depth_reader(taken, [depths.get(frame) for frame in chosen], read, folder / f"*{_DEPTH}")
+    depth, gaps, notes = map_reader(
+        "depth", taken, [depths.get(frame) for frame in chosen], read, folder / f"*{_DEPTH}"
+    )
     gaps += unpictured(frames, pictures, {*depths, *pose_files}, folder / f"*{_PICTURE}")
     nowhere = np.full((4, 4), np.nan)
     poses = np.stack([_pose(pose_files[frame]) if frame in pose_files else nowhere for frame in chosen])
@@ -221,7 +222,7 @@ def _read_kitti(name: str, truth: Path, folder: Path, calibration: Path, frames:
     chosen = [frame for frame in chosen if frame in pictures]
     taken = [pictures[frame] for frame in chosen]
     maps, read = [depths[frame] for frame in chosen], partial(read_png, per_metre=_PER_METRE)
-    depth, more_gaps, more = depth_reader(taken, maps, read, truth / "*.png")
+    depth, more_gaps, more = map_reader("depth", taken, maps, read, truth / "*.png")
     intrinsics = None
     if calibration.is_file():
         intrinsics = np.broadcast_to(_projection(calibration), (len(taken), 3, 3))

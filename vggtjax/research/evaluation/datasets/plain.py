@@ -34,9 +34,8 @@ from vggtjax.research.evaluation.datasets.sequence import (
     FrameChoice,
     LabelledSequence,
     Opener,
-    depth_reader,
     left_out,
-    mask_reader,
+    map_reader,
     unpictured,
 )
 from vggtjax.storage.trajectories import associate, read_numbers, read_trajectory
@@ -89,12 +88,14 @@ def _read(folder: Path, name: str, part: slice, frames: FrameChoice) -> Labelled
     depths, unread = _of_one_kind(folder / "depth", _DEPTH_FILES)
     masks, unread_masks = _of_one_kind(folder / "mask", _MASK_FILES)
     found = [depths.get(path.stem) for path in taken]
-    depth, gaps, notes = depth_reader(taken, found, _read_depth, folder / "depth" / "*.png")
+    depth, gaps, notes = map_reader(
+        "depth", taken, found, lambda path: _DEPTH_FILES[path.suffix.lower()](path), folder / "depth" / "*.png"
+    )
     notes += unread + unread_masks + known.notes
     mask = None
     if masks:
         paths = [masks.get(path.stem) for path in taken]
-        mask, more_gaps, more = mask_reader(taken, paths, read_mask, folder / "mask" / "*.png")
+        mask, more_gaps, more = map_reader("masks", taken, paths, read_mask, folder / "mask" / "*.png")
         notes, gaps = notes + more, gaps + more_gaps
     stems, truth = [path.stem for path in pictures], {*depths, *masks}
     if part != slice(None):
@@ -141,10 +142,6 @@ def _of_one_kind(folder: Path, endings: Iterable[str]) -> tuple[dict[str, Path],
         else ""
     )
     return found, (note,) * bool(note)
-
-
-def _read_depth(path: Path) -> Float32[np.ndarray, "h w"]:
-    return _DEPTH_FILES[path.suffix.lower()](path)
 
 
 def _holds_pictures(folder: Path) -> bool:

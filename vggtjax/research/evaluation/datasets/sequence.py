@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Shaped
@@ -57,18 +57,13 @@ def left_out(
     return (LeftOut(what, tuple(frames), total, why, str(expected), usual),) if frames else ()
 
 
-def _always(frame: int) -> bool:
-    del frame
-    return True
-
-
 class FrameChoice(NamedTuple):
     """A window of frames, of which every `stride`-th is taken unless it is left out, and at most `most`."""
 
     window: slice = slice(None)
     stride: int = 1
     most: int | None = None
-    takes: Callable[[int], bool] = _always  # by its number in the sequence
+    takes: Callable[[int], bool] = lambda frame: True  # by its number in the sequence
 
     def sampled(self, sampling: Sampling) -> FrameChoice:
         """Return the frames of `sampling` within the window; its stride, if any, replaces this stride.
@@ -170,8 +165,7 @@ class LabelledSequence:
     @property
     def resized(self) -> tuple[str, ...]:
         """Notes on the maps that were read so far, of other sizes than their pictures."""
-        depth = self.depth.maps if isinstance(self.depth, DepthMaps) else None
-        readers = {"depth": depth, "mask": self.mask}
+        readers = {"depth": self.depth, "mask": self.mask}
         return tuple(note for what, maps in readers.items() if isinstance(maps, Maps) for note in maps.note(what))
 
     def of_frames(self, chosen: Sequence[int]) -> LabelledSequence:
@@ -197,17 +191,32 @@ class Maps:
     """Reads a file for each frame, at the size of its picture: each pixel takes the value of the file's around it.
 
     Attributes:
+        strict: Refuse another size.
+        is_depth: 0 where it is unknown: not finite, not above 0, or in a frame without a file.
         resized: Sizes of the maps that were read at another size than their pictures, and of these, by frame.
     """
 
     pictures: Sequence[Path]
     paths: Sequence[Path | None]
     read: Callable[[Path], Shaped[np.ndarray, "h w"]]
-    strict: bool = False  # refuse another size
+    strict: bool = False
+    is_depth: bool = False
     resized: dict[int, tuple[tuple[int, ...], tuple[int, int]]] = field(default_factory=dict)
 
     def __call__(self, frame: int) -> Shaped[np.ndarray, "h w"] | None:
-        """Return a frame's map, None where it has no file. Raises OtherShapeError, and InputError for another file."""
+        """Return a frame's map, None for another one than depth without a file.
+
+        Raises OtherShapeError, and InputError for another file.
+        """
+        values = self._fitted(frame)
+        if not self.is_depth:
+            return values
+        if values is None:
+            width, height = picture_size(self.pictures[frame])
+            return np.zeros((height, width), np.float32)
+        return np.where(np.isfinite(values) & (values > 0), values, 0).astype(np.float32)
+
+    def _fitted(self, frame: int) -> Shaped[np.ndarray, "h w"] | None:
         path = self.paths[frame]
         if path is None:
             return None
@@ -249,20 +258,6 @@ def at_size(values: Shaped[np.ndarray, "h w"], size: tuple[int, int]) -> Shaped[
     return values[rows[:, None], columns]
 
 
-@dataclass(frozen=True)
-class DepthMaps:
-    """Reads the depth of frames, 0 where it is unknown: not finite, not above 0, or in a frame without a map."""
-
-    maps: Maps
-
-    def __call__(self, frame: int) -> Float32[np.ndarray, "h w"]:
-        """Return the depth of a frame at the size of its picture; raises what `Maps` raises."""
-        if (values := self.maps(frame)) is None:
-            width, height = picture_size(self.maps.pictures[frame])
-            return np.zeros((height, width), np.float32)
-        return np.where(np.isfinite(values) & (values > 0), values, 0).astype(np.float32)
-
-
 class Labels(NamedTuple):
     """A reader of maps, None where no frame has one, what is left out, and notes."""
 
@@ -271,32 +266,19 @@ class Labels(NamedTuple):
     notes: tuple[str, ...]
 
 
-def depth_reader(
+def map_reader(
+    what: Literal["depth", "masks"],
     pictures: Sequence[Path],
     paths: Sequence[Path | None],
-    read: Callable[[Path], Float32[np.ndarray, "h w"]],
+    read: Callable[[Path], Shaped[np.ndarray, "h w"]],
     expected: Path,
 ) -> Labels:
-    """Return a `DepthMaps` of the frames, the frames without depth, which is `expected` there, and notes."""
+    """Return the `Maps` of the frames, the frames without any, which is `expected` there, and notes."""
     missing = [picture.stem for picture, path in zip(pictures, paths, strict=True) if path is None]
     if len(missing) == len(pictures):
-        return Labels(None, (), (f"it has no depth; expected {expected}",))
-    maps = Maps(pictures, paths, read)
-    return Labels(DepthMaps(maps), left_out("depth", missing, len(paths), "have no depth", expected), ())
-
-
-def mask_reader(
-    pictures: Sequence[Path],
-    paths: Sequence[Path | None],
-    read: Callable[[Path], Bool[np.ndarray, "h w"]],
-    expected: Path,
-) -> Labels:
-    """Return a reader of the frames' masks, the frames without one, which is `expected` there, and notes."""
-    missing = [picture.stem for picture, path in zip(pictures, paths, strict=True) if path is None]
-    if len(missing) == len(pictures):
-        return Labels(None, (), (f"it has no masks; expected {expected}",))
-    maps = Maps(pictures, paths, read)
-    return Labels(maps, left_out("masks", missing, len(paths), "have no mask", expected), ())
+        return Labels(None, (), (f"it has no {what}; expected {expected}",))
+    maps, why = Maps(pictures, paths, read, is_depth=what == "depth"), f"have no {what.removesuffix('s')}"
+    return Labels(maps, left_out(what, missing, len(paths), why, expected), ())
 
 
 def refuse_left_out(sequence: LabelledSequence) -> LabelledSequence:
@@ -304,10 +286,8 @@ def refuse_left_out(sequence: LabelledSequence) -> LabelledSequence:
     for each in sequence.left_out:
         if not each.usual:
             raise InputError(f"{each.sentence}; add them, or score the other frames, without --strict")
-    depth, mask = sequence.depth, sequence.mask
-    if isinstance(depth, DepthMaps):
-        depth = DepthMaps(replace(depth.maps, strict=True))
-    return replace(sequence, depth=depth, mask=replace(mask, strict=True) if isinstance(mask, Maps) else mask)
+    depth, mask = (replace(x, strict=True) if isinstance(x, Maps) else x for x in (sequence.depth, sequence.mask))
+    return replace(sequence, depth=depth, mask=mask)
 
 
 def read_labels(path: Path) -> Bool[np.ndarray, "h w"]:

@@ -30,8 +30,8 @@ from vggtjax.research.evaluation.datasets.sequence import (
     LabelledSequence,
     LeftOut,
     Opener,
-    depth_reader,
     left_out,
+    map_reader,
 )
 
 _BONN = (542.822841, 542.576870, 315.593520, 237.756098)
@@ -134,7 +134,7 @@ def _sequence(
     chosen = [chosen[place] for place in there]
     taken = [pictures.paths[frame] for frame in chosen]
     maps = depth_files(folder, pictures.times, chosen, whole=False) or (None,) * len(taken)
-    depth, gaps, more = depth_reader(taken, maps, partial(read_png, per_metre=PER_METRE), folder / "depth.txt")
+    depth, gaps, more = map_reader("depth", taken, maps, partial(read_png, per_metre=PER_METRE), folder / "depth.txt")
     return LabelledSequence(
         name,
         tuple(taken),
