@@ -12,13 +12,13 @@ from jaxtyping import Float, Float64
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
+from vggtjax.cameras import checked_centres
 from vggtjax.clips.truth import Truth
 from vggtjax.errors import InputError
 from vggtjax.progress import Progress
 from vggtjax.research.evaluation.ladder import LadderRow
 from vggtjax.research.evaluation.metrics.depth import depth_errors, measured
 from vggtjax.research.evaluation.metrics.trajectory import from_first, rotation_error
-from vggtjax.similarity import centres
 from vggtjax.training.scenes import SceneConfig, generate, load_textures
 
 
@@ -202,13 +202,13 @@ def best_angular_velocity(truth: Float[np.ndarray, "S 3 4"]) -> Float64[np.ndarr
 
 def still_centre_error(truth: Float[np.ndarray, "S 3 4"]) -> float:
     """Return the RMSE of centres that all coincide: no similarity reduces the spread about their mean."""
-    points = centres(truth)
+    points = checked_centres(truth)
     return float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean()))
 
 
 def line_centre_error(truth: Float[np.ndarray, "S 3 4"]) -> float:
     """Return the RMSE of centres on a line at equal steps, after Sim(3) alignment: that of linear regression."""
-    points = centres(truth)
+    points = checked_centres(truth)
     times = np.arange(len(points)) - (len(points) - 1) / 2
     offsets = points - points.mean(axis=0)
     velocity = times @ offsets / (times @ times)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.summaries import METRICS, Summary
-from vggtjax.similarity import centres, umeyama_sim3
+from vggtjax.cameras import checked_centres, umeyama_sim3
 from vggtjax.storage.writing import writing
 
 SHOWN = ("abs_rel", "rotation_error", "centre_error", "point_distance_first")  # of those compared with the plain pass
@@ -86,12 +86,12 @@ def plot_paths(path: Path, cameras: dict[str, np.ndarray], true: np.ndarray, tit
     columns = 3
     rows = -(-len(cameras) // columns)
     figure = Figure(figsize=(4 * columns, 4 * rows), layout="constrained")
-    wanted = centres(true)
+    wanted = checked_centres(true)
     every = figure.subplots(rows, columns, squeeze=False).ravel()
     for axes in every[len(cameras) :]:
         axes.set_axis_off()
     for axes, (way, poses) in zip(every, cameras.items(), strict=False):
-        found = umeyama_sim3(centres(poses), wanted, allow_line=True).apply(centres(poses))
+        found = umeyama_sim3(checked_centres(poses), wanted, allow_line=True).apply(checked_centres(poses))
         axes.plot(wanted[:, 0], wanted[:, 2], color="0.6", linewidth=3, label="true")
         axes.plot(found[:, 0], found[:, 2], color="tab:blue", linewidth=1.2, label="found")
         axes.plot(*found[[0, -1]][:, [0, 2]].T, ".", color="tab:red", label="first, last")

@@ -14,7 +14,7 @@ from rich.console import Console
 from scipy.spatial import KDTree
 from trimesh.sample import sample_surface
 
-from vggtjax.cameras import unproject
+from vggtjax.cameras import umeyama_sim3, unproject
 from vggtjax.clips.clip import load_clip
 from vggtjax.clips.truth import Truth, at_clip_pixels, batched_truth, intrinsics_at_clip_pixels
 from vggtjax.errors import InputError
@@ -23,7 +23,6 @@ from vggtjax.research.evaluation.metrics.point_clouds import nearest_distances
 from vggtjax.results.exports.mesh import static_mesh
 from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.shown import shown_points
-from vggtjax.similarity import umeyama_sim3
 from vggtjax.storage.writing import staging, writing
 from vggtjax.training.scenes import SceneConfig, held_out_scenes
 from vggtjax.training.scenes.held_out import Kind

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from vggtjax import cameras as geometry
+from vggtjax.cameras import Similarity, umeyama_sim3
 from vggtjax.errors import InputError, ResultError
-from vggtjax.similarity import Similarity, umeyama_sim3
 
 
 def test_unproject_at_corners_equals_the_public_code(golden):

@@ -336,18 +336,18 @@ def gallery_sheet(clip: Clip, number: int) -> Figure:
 
 def _cameras(axes: Any, clip: Clip) -> None:
     """Plot the paths of both passes and the true one from above, in the axes of the first camera."""
+    from vggtjax.cameras import checked_centres, umeyama_sim3
     from vggtjax.network.heads.pose import decode_pose
-    from vggtjax.similarity import centres, umeyama_sim3
 
     true = np.asarray(clip.truth.camera_from_world)
     size = clip.result.depth.shape[1:3]
-    ways = {"truth": (centres(true), _TRUE)}
+    ways = {"truth": (checked_centres(true), _TRUE)}
     for name, predictions, colour in (
         ("pass 1", clip.result.passes.first, _FIRST), ("pass 2", clip.result.passes.second, _SECOND),
     ):  # fmt: skip
-        found = centres(np.asarray(decode_pose(predictions.pose_encoding, size)[0][0]))
-        ways[name] = (umeyama_sim3(found, centres(true)).apply(found), colour)
-    rotation, origin = true[0, :, :3], centres(true)[0]
+        found = checked_centres(np.asarray(decode_pose(predictions.pose_encoding, size)[0][0]))
+        ways[name] = (umeyama_sim3(found, checked_centres(true)).apply(found), colour)
+    rotation, origin = true[0, :, :3], checked_centres(true)[0]
     for name, (way, colour) in ways.items():
         x, _, z = ((way - origin) @ rotation.T).T
         axes.plot(x, z, "o-", color=colour, label=name, markersize=3.5, linewidth=1.5)

@@ -13,11 +13,11 @@ import pytest
 from tests.pipeline.windows import walk as walks
 from tests.pipeline.windows.walk import CONFIG, FRAMES, movers, walk, window_result
 from tests.shared.contents import contents
+from vggtjax.cameras import checked_centres, umeyama_sim3
 from vggtjax.errors import ClipError, InputError, OutputError
 from vggtjax.pipeline.windows.run import run_windows
 from vggtjax.pipeline.windows.store import FOLDER
 from vggtjax.results.reconstruction import Reconstruction
-from vggtjax.similarity import centres, umeyama_sim3
 from vggtjax.storage.writing import locked_folder
 
 NOTHING = np.zeros((FRAMES, CONFIG.height, CONFIG.width), bool)
@@ -35,7 +35,7 @@ def reconstructed(out, run, *, loops=False, masks=True, source=None) -> Reconstr
 
 def path_error(result) -> float:
     """Return the largest distance of a camera from the truth after Sim(3), as a share of the path's extent."""
-    found, true = centres(result.camera_from_world), centres(walk().camera_from_world)
+    found, true = checked_centres(result.camera_from_world), checked_centres(walk().camera_from_world)
     return np.linalg.norm(umeyama_sim3(found, true).apply(found) - true, axis=1).max() / np.ptp(true, axis=0).max()
 
 
@@ -51,7 +51,7 @@ def test_a_result_knows_its_source_which_is_looked_at_once(tmp_path, monkeypatch
 def test_exact_windows_give_the_exact_path_and_depth(tmp_path):
     result, true = reconstructed(tmp_path, exact, loops=True), walk()
     assert path_error(result) < 1e-5
-    scale = umeyama_sim3(centres(result.camera_from_world), centres(true.camera_from_world)).scale
+    scale = umeyama_sim3(checked_centres(result.camera_from_world), checked_centres(true.camera_from_world)).scale
     assert np.abs(scale * result.depth / true.depth - 1).max() < 1e-5
     assert np.array_equal(result.images, np.round(255 * true.images).astype(np.uint8))
     assert result.frame_names == tuple(f"{frame:06d}" for frame in range(FRAMES))

@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from vggtjax.cameras import Similarity
 from vggtjax.errors import InputError
 from vggtjax.pipeline.windows.graph import Edge, solve_graph
 from vggtjax.pipeline.windows.loops import described_frames, find_loops, frames_around
 from vggtjax.pipeline.windows.plan import plan_windows
-from vggtjax.similarity import Similarity
 
 
 def random_similarity(generator, size=1.0) -> Similarity:

@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tests.shared.generated import QUICK, textures
+from vggtjax.cameras import Similarity, align
 from vggtjax.clips.clip import Clip
 from vggtjax.clips.preprocessing import Fitter
 from vggtjax.clips.truth import Truth
@@ -15,7 +16,6 @@ from vggtjax.pipeline.windows.plan import Windows
 from vggtjax.pipeline.windows.run import LongRun, Tools
 from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.saving import Saving
-from vggtjax.similarity import Similarity, align
 from vggtjax.training.scenes import SceneConfig, closed_walk, render, sample_scene
 
 FRAMES = 60

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from tests.shared.seeded import seeded_images
 from tests.shared.tiny import tiny_config
 from vggtjax import Reconstruction, assemble, infer, init_params, load_clip
+from vggtjax.cameras import checked_centres, umeyama_sim3
 from vggtjax.clips.truth import Truth
 from vggtjax.errors import InputError
 from vggtjax.method.mask import upsample
@@ -20,7 +21,6 @@ from vggtjax.research.evaluation.ladder import LadderRow, error_table, ladder, s
 from vggtjax.research.evaluation.metrics.depth import depth_errors, median_scale
 from vggtjax.research.evaluation.metrics.masks import auc, jaccard
 from vggtjax.research.evaluation.metrics.trajectory import centre_error, rotation_error
-from vggtjax.similarity import centres, umeyama_sim3
 
 CLIPS, FRAMES, SIZE = 3, 4, (28, 42)
 SETTING = ("method", "mask_source", "mask_pairs", "suppress")
@@ -128,7 +128,7 @@ def test_a_result_is_scored_as_its_row(truth, rows, passes):
 
 def point_distances(depth, intrinsics, poses, clip) -> list[float]:
     """Lift pixel by pixel, from the definition: aligned by all centres, and as seen from the first camera."""
-    similarity = umeyama_sim3(centres(poses), centres(clip.camera_from_world))
+    similarity = umeyama_sim3(checked_centres(poses), checked_centres(clip.camera_from_world))
     scale, distances = np.median(clip.depth[clip.depth > 0] / depth[clip.depth > 0]), []
     for frame, row, column in np.argwhere(clip.depth > 0):
         pixel, points, seen = np.array([column, row, 1.0]), [], []

@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from tests.shared.scored_room import room_and_truth
 from vggtjax import cameras as geometry
+from vggtjax.cameras import Similarity, align
 from vggtjax.research.evaluation.protocol import depth_at_source, score
 from vggtjax.research.evaluation.truth_at_pixels import TruthAtPixels
-from vggtjax.similarity import Similarity, align
 
 CLOUDS = ("accuracy", "completeness", "distance_paired", "distance_chamfer")
 POINTS = [f"{name}_{kind}" for name in CLOUDS for kind in ("mean", "median")]

@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 from scipy.spatial.transform import Rotation
 
+from vggtjax.cameras import Similarity, align, checked_centres
 from vggtjax.results.result import Result, inside_box, show_points
-from vggtjax.similarity import Similarity, align, centres
 
 
 class View(NamedTuple):
@@ -75,6 +75,6 @@ def blend_cameras(views: Sequence[View]) -> Float64[np.ndarray, "3 4"]:
     """Return the camera of a frame in the world of the whole clip."""
     poses = np.concatenate([align(view.result.camera_from_world[view.number][None], view.similarity) for view in views])
     weights = np.array([view.weight for view in views])
-    centre = weights @ centres(poses)
+    centre = weights @ checked_centres(poses)
     rotation = Rotation.from_matrix(poses[:, :, :3]).mean(weights).as_matrix()
     return np.concatenate([rotation, -(rotation @ centre)[:, None]], axis=1)

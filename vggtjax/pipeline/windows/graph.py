@@ -15,8 +15,8 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
 
+from vggtjax.cameras import Similarity
 from vggtjax.errors import InputError
-from vggtjax.similarity import Similarity
 
 _FREEDOM = 7  # logarithm of the scale, rotation vector, translation
 _OUTLIER = 0.1  # relative: an edge that asks for much more of the others loses its say

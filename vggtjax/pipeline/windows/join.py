@@ -15,9 +15,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from vggtjax.cameras import camera_centres, unproject
+from vggtjax.cameras import Similarity, camera_centres, umeyama_sim3, unproject
 from vggtjax.results.result import Result, inside_box, show_points
-from vggtjax.similarity import Similarity, umeyama_sim3
 
 _LEAST_PIXELS = 64  # fewer shared pixels say less than the cameras do
 _LEAST_SCALE = 0.01  # of the residuals, relative to depth: smaller ones are rounding or the grain of the depth

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float32
 
+from vggtjax.cameras import Similarity
 from vggtjax.clips.clip import Clip
 from vggtjax.clips.queries import Queries
 from vggtjax.pipeline.windows.blend import View, blend_frame
@@ -28,7 +29,6 @@ from vggtjax.pipeline.windows.tracks import Follow, Tracked, follow_points
 from vggtjax.progress import OnStage, Progress, no_progress, no_stage
 from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.result import ARRAYS
-from vggtjax.similarity import Similarity
 
 _LOOPS = 0.5  # tried, at most, for each window
 _WORSE = 2.0  # times the usual residual of neighbours; a loop window that fits worse shows another place

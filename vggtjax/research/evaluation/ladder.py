@@ -12,6 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
+from vggtjax.cameras import Similarity, checked_centres, umeyama_sim3
 from vggtjax.clips.truth import ClipTruth, Truth, batched_truth
 from vggtjax.config import Suppress
 from vggtjax.errors import InputError
@@ -31,7 +32,6 @@ from vggtjax.research.evaluation.metrics.trajectory import centre_error, rotatio
 from vggtjax.research.evaluation.truth_at_pixels import known_points
 from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.report import ErrorTable
-from vggtjax.similarity import Similarity, centres, umeyama_sim3
 
 MaskSource = Literal["mined", "matches", "true"]
 
@@ -336,7 +336,7 @@ def _row(
         return None if points is None else paired_distance(align().apply(points), scene.points).mean
 
     def all_cameras() -> Similarity:
-        return umeyama_sim3(centres(camera_from_world), centres(truth.camera_from_world))
+        return umeyama_sim3(checked_centres(camera_from_world), checked_centres(truth.camera_from_world))
 
     def first_camera() -> Similarity:
         return _first_to_first(camera_from_world[0], truth.camera_from_world[0], median_scale(depth, truth.depth))

@@ -6,12 +6,12 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
+from vggtjax.cameras import checked_centres, moves, umeyama_sim3
 from vggtjax.clips.truth import Truth
 from vggtjax.research.evaluation.metrics.depth import median_scale
 from vggtjax.results.grid import BACKGROUND, FAINT, MARGIN, TEXT, Row, draw_grid, fitted
 from vggtjax.results.previews import color_depth, inverse_depth_range, overlay
 from vggtjax.results.reconstruction import Reconstruction
-from vggtjax.similarity import centres, moves, umeyama_sim3
 
 _FRAMES = 6
 _SIDE = 220  # of a picture, in pixels
@@ -56,12 +56,12 @@ def _cameras_from_above(
     """Plot centres from above, x to the right and z up, in the axes of the true first camera; `found` by name."""
     picture = Image.new("RGB", (_PLOT + MARGIN, _PLOT + 2 * MARGIN + 60), BACKGROUND)
     draw, font, corner = ImageDraw.Draw(picture), ImageFont.load_default(15), (0, MARGIN + 12)
-    true_rotation, origin = true[0, :, :3], centres(true)[0]
-    ways = {"true": (centres(true), _TRUE)}
+    true_rotation, origin = true[0, :, :3], checked_centres(true)[0]
+    ways = {"true": (checked_centres(true), _TRUE)}
     for name, (poses, colour) in found.items():
-        if moves(centres(true)) and moves(centres(poses)):
-            aligned = umeyama_sim3(centres(poses), centres(true), allow_line=True).apply(centres(poses))
-            ways[name] = (aligned, colour)
+        way, true_way = checked_centres(poses), checked_centres(true)
+        if moves(true_way) and moves(way):
+            ways[name] = (umeyama_sim3(way, true_way, allow_line=True).apply(way), colour)
     flat = {name: ((way - origin) @ true_rotation.T)[:, [0, 2]] for name, (way, _) in ways.items()}
     points = np.concatenate(list(flat.values()))
     middle, span = (points.max(0) + points.min(0)) / 2, max(np.ptp(points, axis=0).max(), 1e-9)

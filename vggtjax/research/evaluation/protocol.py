@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 from scipy.ndimage import map_coordinates
 
+from vggtjax.cameras import Similarity, checked_centres, umeyama_sim3
 from vggtjax.errors import InputError
 from vggtjax.research.evaluation.metrics.depth import Align, depth_alignment, video_depth_errors
 from vggtjax.research.evaluation.metrics.masks import Empty, auc, frame_scores, mask_statistics
@@ -20,7 +21,6 @@ from vggtjax.research.evaluation.metrics.uncertainty import reliability_curve, s
 from vggtjax.research.evaluation.truth_at_pixels import AbsentError, TruthAtPixels, known_points
 from vggtjax.results.frame import source_pixels
 from vggtjax.results.result import Result, missing_fields
-from vggtjax.similarity import Similarity, centres, umeyama_sim3
 
 _HISTOGRAM = np.geomspace(1e-3, 10, 41)  # metres, bins of point distances
 _UNKNOWN = np.float32(0)  # depth of pixels without a prediction; they are not scored
@@ -104,7 +104,7 @@ def _trajectory(result: Result, truth: TruthAtPixels) -> _Outputs:
 
 
 def _alignment(result: Result, truth: TruthAtPixels, *, allow_line: bool = False) -> Similarity:
-    found = centres(result.camera_from_world[truth.posed])
+    found = checked_centres(result.camera_from_world[truth.posed])
     return umeyama_sim3(found, truth.poses[:, :3, 3], allow_line=allow_line)
 
 

@@ -8,12 +8,11 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64
 
-from vggtjax.cameras import unproject, world_from_camera
+from vggtjax.cameras import FEWEST_POSES, moves, unproject, world_from_camera
 from vggtjax.clips.captures.capture import OtherShapeError
 from vggtjax.clips.truth import Placed, at_clip_pixels, intrinsics_at_clip_pixels
 from vggtjax.errors import InputError
 from vggtjax.research.evaluation.datasets.sequence import LabelledSequence, LeftOut, left_out
-from vggtjax.similarity import FEWEST_POSES, moves
 
 PIXEL_OFFSET = 0.0  # of points: the protocol lifts whole pixel numbers, predicted and true ones alike
 

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from tests.test_cameras import random_similarity
+from vggtjax.cameras import align, checked_centres, umeyama_sim3
 from vggtjax.errors import InputError
 from vggtjax.research.evaluation.metrics.trajectory import associate, centre_error, rotation_error, trajectory_errors
-from vggtjax.similarity import align, centres, umeyama_sim3
 
 
 def cameras(points, rotation=None) -> np.ndarray:
@@ -55,7 +55,7 @@ def test_rotation_error_by_hand():
     assert rotation_error(predicted, truth) == pytest.approx((6 + 2) / 2)
     assert rotation_error(still(3), truth) == pytest.approx((10 + 30) / 2)
     truth = cameras([[0, 0, 0], [1, 0, 0], [2, 0, 0], [2, 1, 0]])
-    turned = cameras(centres(truth), about(2, [0, 3, 3, 7]))
+    turned = cameras(checked_centres(truth), about(2, [0, 3, 3, 7]))
     errors = trajectory_errors(world_from(turned), world_from(truth))  # steps turn by 3, 0 and 4 degrees too much
     assert errors.rre == pytest.approx(np.sqrt((9 + 0 + 16) / 3))
     # Each step is seen from a camera turned by 0, 3, 3 degrees: a step of length 1 is off by 2 sin(angle / 2).

@@ -8,11 +8,10 @@ import numpy as np
 from jaxtyping import Float, Float64
 from scipy.spatial.transform import Rotation
 
-from vggtjax.cameras import checked_poses
+from vggtjax.cameras import FEWEST_POSES, Similarity, checked_centres, checked_poses, umeyama_sim3
+from vggtjax.cameras import align as moved
+from vggtjax.cameras import moves as is_moving
 from vggtjax.errors import InputError, check_choice
-from vggtjax.similarity import FEWEST_POSES, Similarity, centres, umeyama_sim3
-from vggtjax.similarity import align as moved
-from vggtjax.similarity import moves as is_moving
 from vggtjax.storage.trajectories import associate as associate  # a step of every comparison with a recorded path
 
 Alignment = Literal["sim3", "se3", "first"]
@@ -73,14 +72,14 @@ def trajectory_errors(
     if align == "first":
         source, target = _pair(source, target, 2)
         rotation = target[0, :, :3].T @ source[0, :, :3]
-        similarity = Similarity(1.0, rotation, centres(target)[0] - rotation @ centres(source)[0])
+        similarity = Similarity(1.0, rotation, checked_centres(target)[0] - rotation @ checked_centres(source)[0])
     else:
         similarity = umeyama_sim3(*_moving(source, target), allow_line=True, with_scale=align == "sim3")
     aligned = moved(source, similarity)
     (steps, moves), (true_steps, true_moves) = _steps(aligned), _steps(target)
     angles = (true_steps.inv() * steps).magnitude()
     return TrajectoryErrors(
-        _rmse(centres(aligned) - centres(target)),
+        _rmse(checked_centres(aligned) - checked_centres(target)),
         _rmse(true_steps.inv().apply(moves - true_moves)),
         float(np.degrees(np.sqrt((angles**2).mean()))),
     )
@@ -111,7 +110,7 @@ def _pair(predicted, truth, fewest: int) -> tuple[Float64[np.ndarray, "S 3 4"], 
 
 
 def _moving(predicted, truth) -> tuple[Float64[np.ndarray, "S 3"], Float64[np.ndarray, "S 3"]]:
-    predicted, truth = (centres(poses) for poses in _pair(predicted, truth, FEWEST_POSES))
+    predicted, truth = (checked_centres(poses) for poses in _pair(predicted, truth, FEWEST_POSES))
     for name, points in (("predicted", predicted), ("true", truth)):
         if not is_moving(points):
             raise InputError(f"the {name} cameras do not move; their centres cannot be aligned")
@@ -120,7 +119,7 @@ def _moving(predicted, truth) -> tuple[Float64[np.ndarray, "S 3"], Float64[np.nd
 
 def _steps(camera_from_world: Float64[np.ndarray, "S 3 4"]) -> tuple[Rotation, Float64[np.ndarray, "S-1 3"]]:
     """Return P_i^-1 P_i+1 of world-from-camera poses P: each camera relative to the camera before it."""
-    rotations, positions = _rotations(camera_from_world), centres(camera_from_world)
+    rotations, positions = _rotations(camera_from_world), checked_centres(camera_from_world)
     return rotations[:-1] * rotations[1:].inv(), rotations[:-1].apply(np.diff(positions, axis=0))
 
 
