@@ -41,7 +41,11 @@ FOREIGN = (
     ),
     Stranger("Pi3", "it has other decoders, and no reference frame", r"(point|conf|camera)_decoder\."),
     Stranger("MapAnything", "it has another encoder of images and geometry", r"(model\.)?(info_sharing\.|scale_token)"),
-    Stranger("Depth Anything 3", "it has one plain transformer", r"(model\.)?(da3\.|backbone\.pretrained\.)"),
+    Stranger(
+        "Depth Anything 3 Nested",
+        "it is two models, any-view and metric; the any-view one alone is published as DA3-GIANT-1.1",
+        r"(model\.)?da3(_metric)?\.",
+    ),
     Stranger("AnySplat", "it predicts Gaussians", r"encoder\.(aggregator|gaussian_param_head)\."),
     Stranger("HunyuanWorld-Mirror", "it takes priors and predicts Gaussians", r"visual_geometry_transformer\."),
 )
@@ -60,5 +64,5 @@ def refuse_foreign(source: str, keys: Iterable[str] = (), sha256: Mapping[str, s
         if has_its_name or has_its_content or any(re.match(stranger.key, key) for key in keys):
             raise CheckpointError(
                 f"{source} is a checkpoint of {stranger.name}, not of VGGT: {stranger.difference}; expected weights "
-                "of VGGT" + ("; rename them if they are weights of VGGT" if has_its_name else "")
+                "of VGGT or Depth Anything 3" + ("; rename them if they are weights of VGGT" if has_its_name else "")
             )

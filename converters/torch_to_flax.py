@@ -1,4 +1,4 @@
-"""PyTorch VGGT weights -> parameter tree by the rule table, checked strictly: in memory, or file to file."""
+"""PyTorch weights -> parameter tree by the rule table, checked strictly: in memory, or file to file."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import lru_cache
 from itertools import count, groupby
 from math import prod
 from operator import attrgetter
@@ -19,9 +20,10 @@ from flax.traverse_util import unflatten_dict
 from converters.files import Tensor, read_state_dict, weight_files
 from converters.foreign import refuse_foreign
 from converters.locate import Weights, locate
-from converters.rules import IGNORED, RULES, Transform
+from converters.published import published_config, shared_once
+from converters.rules import IGNORED, Rule, Transform, rules
 from converters.trained import own_heads, own_names
-from vggtjax.config import VGGT_HEADS, VGGTConfig, vggt_1b
+from vggtjax.config import VGGTConfig
 from vggtjax.errors import CheckpointError, InputError, problems_sentence, reading
 from vggtjax.network.checkpoint import DType, flat_shapes, numpy_dtype, write_checkpoint
 from vggtjax.progress import Progress, no_progress
@@ -29,7 +31,6 @@ from vggtjax.storage.tensor_file import Spec
 
 T = TypeVar("T")
 
-_RULES = {path: list(rules) for path, rules in groupby(sorted(RULES, key=attrgetter("path")), attrgetter("path"))}
 _FLOATS = tuple(np.dtype(kind) for kind in (np.float32, ml_dtypes.bfloat16, np.float16, np.float64))
 _DIGEST_BLOCK = 2**20  # bytes of a source file per step of progress
 
@@ -49,7 +50,8 @@ class Conversion(NamedTuple):
 
     def summary(self) -> dict[str, Any]:
         """Return the conversion's facts for display, as plain values."""
-        heads = sorted({name.split(".")[0] for name in self.left_out if name not in IGNORED})
+        ignored = IGNORED[self.config.family].fullmatch
+        heads = sorted({name.split(".")[0] for name in self.left_out if not ignored(name)})
         return {
             "wrote": str(self.path),
             "tensors": f"{self.tensors} converted, {len(self.left_out)} left out"
@@ -91,7 +93,7 @@ def convert_state_dict(state_dict: Mapping[str, np.ndarray], config: VGGTConfig)
     or names the other network of the state dict.
     """
     refuse_foreign("the state dict", state_dict)
-    tensors = {name: np.asarray(value) for name, value in _own(state_dict, "the state dict").items()}
+    tensors = {name: np.asarray(value) for name, value in _own(state_dict, config, "the state dict").items()}
     targets = plan_conversion(tensors, config)
     flat = {path: np.concatenate(list(target.parts(tensors))) for path, target in targets.items()}
     return unflatten_dict(flat, sep=".")
@@ -106,14 +108,15 @@ def convert(
     heads: Sequence[str] | None = None,
     progress: Progress | None = None,
 ) -> Conversion:
-    """Convert weights of a PyTorch VGGT to a checkpoint of this library; memory holds one source tensor at a time.
+    """Convert weights of a PyTorch model to a checkpoint of this library; memory holds one source tensor at a time.
 
     Args:
         source: a .safetensors file, the index or folder of shards, a .pt or .pth file, or a hub id, which may end in
             "@" and a commit of 40 hexadecimal letters.
         destination: the file to write; an existing file is replaced.
         dtype: of the parameters in the checkpoint.
-        config: the model's configuration; None for VGGT-1B. Weights do not tell the numbers of attention heads.
+        config: the model's configuration; None for that of a published model: VGGT-1B, or the Depth Anything 3 of the
+            weights' width. Weights do not tell the numbers of attention heads.
         heads: names of the heads to convert, in any order; None for all heads of the configuration. The source may lack
             the other heads.
         progress: called with the number of steps done and the total: tensors, and hashed blocks of the source.
@@ -125,12 +128,7 @@ def convert(
         OutputError: the destination cannot be written.
         MissingExtraError: the source needs torch or huggingface_hub, which is not installed.
     """
-    config = config or vggt_1b()
-    if heads is not None:
-        if unknown := [name for name in heads if name not in config.heads]:
-            raise InputError(f"heads has {unknown}; expected some of {config.heads}")
-        config = dataclasses.replace(config, heads=tuple(name for name in config.heads if name in heads))
-    return convert_weights(locate(source), destination, dtype=dtype, config=config, progress=progress)
+    return convert_weights(locate(source), destination, dtype=dtype, config=config, heads=heads, progress=progress)
 
 
 def convert_weights(
@@ -138,7 +136,8 @@ def convert_weights(
     destination: str | Path,
     *,
     dtype: DType,
-    config: VGGTConfig,
+    config: VGGTConfig | None,
+    heads: Sequence[str] | None = None,
     with_its_heads: bool = False,
     progress: Progress | None = None,
 ) -> Conversion:
@@ -151,7 +150,12 @@ def convert_weights(
             raise InputError(f"the destination {destination} is the source; choose another name")
     tensors, problems = read_state_dict(weights.path)
     refuse_foreign(weights.name, tensors)
-    tensors = _own(tensors, weights.name)
+    config = config or published_config(tensors, weights)
+    if heads is not None:
+        if unknown := [name for name in heads if name not in config.heads]:
+            raise InputError(f"heads has {unknown}; expected some of {config.heads}")
+        config = dataclasses.replace(config, heads=tuple(name for name in config.heads if name in heads))
+    tensors = _own(tensors, config, weights.name)
     if with_its_heads:
         config = own_heads(tensors, config, weights.name)
     targets = plan_conversion(tensors, config, problems)
@@ -185,13 +189,13 @@ def convert_weights(
     )
 
 
-def _own(tensors: Mapping[str, T], source: str) -> Mapping[str, T]:
-    """Return tensors by VGGT's own names; raises CheckpointError as `own_names`, and for another network's names."""
-    modules = {rule.source.partition(".")[0] for rule in RULES}
+def _own(tensors: Mapping[str, T], config: VGGTConfig, source: str) -> Mapping[str, T]:
+    """Return tensors by the network's own names; raises CheckpointError as `own_names`, and for another network's."""
+    modules = {rule.source.partition(".")[0] for rule in rules(config)}
     own = own_names(tensors, modules, source)
     if own is not tensors:
         refuse_foreign(source, own)
-    return own
+    return shared_once(own, source)
 
 
 def plan_conversion(
@@ -205,8 +209,8 @@ def plan_conversion(
     shapes = flat_shapes(config)
     problems = list(problems)
     targets: dict[str, Target] = {}
-    known = IGNORED | _keys_of_other_heads(config)
-    for path, keys in _expected(shapes).items():
+    known, is_ignored = _keys_of_other_heads(config), IGNORED[config.family].fullmatch
+    for path, keys in _expected(shapes, config).items():
         sources = []
         for key in keys:
             known |= set(key.names)
@@ -221,9 +225,9 @@ def plan_conversion(
                 if tensors[name].dtype not in _FLOATS:
                     problems.append(f"key {name} has type {tensors[name].dtype}, expected floating point")
             sources += names
-        rule = _RULES[path][0]
+        rule = _table(config)[path][0]
         targets[path] = Target(shapes[path], rule.transform, sources, rule.stacked)
-    problems += [f"unknown key {name}" for name in tensors if name not in known]
+    problems += [f"unknown key {name}" for name in tensors if name not in known and not is_ignored(name)]
     if problems:
         subject = f"the checkpoint does not fit the configuration{_hint(tensors, config)}"
         raise CheckpointError(problems_sentence(subject, problems))
@@ -232,15 +236,15 @@ def plan_conversion(
 
 def source_shapes(config: VGGTConfig) -> dict[str, tuple[int, ...]]:
     """Return name -> shape of the tensors in a published state dict, without the ignored ones."""
-    expected = (key for keys in _expected(flat_shapes(config)).values() for key in keys)
+    expected = (key for keys in _expected(flat_shapes(config), config).values() for key in keys)
     return {key.names[0]: key.shape for key in expected}
 
 
 def _keys_of_other_heads(config: VGGTConfig) -> set[str]:
     """Return the source names of the heads that the model lacks."""
-    whole = flat_shapes(dataclasses.replace(config, heads=VGGT_HEADS))
+    whole = flat_shapes(dataclasses.replace(config, heads=config.row.heads))
     absent = {path: shape for path, shape in whole.items() if path not in flat_shapes(config)}
-    return {name for keys in _expected(absent).values() for key in keys for name in key.names}
+    return {name for keys in _expected(absent, config).values() for key in keys for name in key.names}
 
 
 def _hint(tensors: Mapping[str, Tensor], config: VGGTConfig) -> str:
@@ -273,13 +277,19 @@ class _Key(NamedTuple):
     shape: tuple[int, ...]
 
 
-def _expected(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, list[_Key]]:
+@lru_cache(maxsize=8)
+def _table(config: VGGTConfig) -> Mapping[str, list[Rule]]:
+    """Return target path -> its rules."""
+    by_path = attrgetter("path")
+    return {path: list(group) for path, group in groupby(sorted(rules(config), key=by_path), by_path)}
+
+
+def _expected(shapes: Mapping[str, tuple[int, ...]], config: VGGTConfig) -> dict[str, list[_Key]]:
     """Return target path -> source tensors, in order of layers."""
     expected = {}
     for path, shape in shapes.items():
-        rules = _RULES[path]
-        layers, part = (range(shape[0]), shape[1:]) if rules[0].stacked else (range(1), shape)
-        source_shape = rules[0].transform.source_shape(part)
-        names = [[rule.source.replace("{layer}", str(layer)) for rule in rules] for layer in layers]
-        expected[path] = [_Key(aliases, source_shape) for aliases in names]
+        aliases = _table(config)[path]
+        layers, part = (range(shape[0]), shape[1:]) if aliases[0].stacked else (range(1), shape)
+        source_shape = aliases[0].transform.source_shape(part)
+        expected[path] = [_Key([rule.name(layer) for rule in aliases], source_shape) for layer in layers]
     return expected

@@ -17,15 +17,19 @@ T = TypeVar("T")
 _ADAPTER = re.compile(r"(?:^|\.)(?:lora_|hada_|lokr_|ia3_|oft_|base_layer\.)")
 _COUNTED = ("n_averaged",)  # of torch's AveragedModel, beside its module
 _MOST_LETTERS = 100  # of a prefix
-SOURCES = {"camera": "camera_head", "depth": "depth_head", "points": "point_head", "tracks": "track_head"}
+SOURCES = {  # the modules of heads, by family
+    "vggt": {"camera": "camera_head", "depth": "depth_head", "points": "point_head", "tracks": "track_head"},
+    "da3": {"camera": "cam_dec", "depth": "head", "rays": "head"},
+}
+_USUAL = "model."  # prefix of published files
 
 logger = logging.getLogger(__name__)
 
 
 def own_names(tensors: Mapping[str, T], modules: Collection[str], source: str) -> Mapping[str, T]:
-    """Return tensors by VGGT's own names, without a prefix that all of them share, such as `module.`; say which.
+    """Return tensors by the network's own names, without a prefix that all of them share, such as `module.`; say which.
 
-    `modules` are the first words of VGGT's names. Raises CheckpointError for an adapter that is not merged into its
+    `modules` are the first words of its names. Raises CheckpointError for an adapter that is not merged into its
     weights, and for weights that are there twice, such as beside their moving average.
     """
     if adapters := [name for name in tensors if _ADAPTER.search(name)]:
@@ -37,11 +41,14 @@ def own_names(tensors: Mapping[str, T], modules: Collection[str], source: str) -
     copies = [prefix for prefix, count in found.items() if 2 * count > max(found.values())]
     if len(copies) > 1:
         names = " and ".join(repr(prefix) if prefix else "no prefix" for prefix in sorted(copies))
-        raise CheckpointError(f"{source} holds weights of VGGT twice or more, under {names}; save one of them alone")
+        raise CheckpointError(
+            f"{source} holds weights of the network twice or more, under {names}; save one of them alone"
+        )
     (prefix,) = copies or ("",)
     if not prefix:
         return tensors
-    logger.warning("the keys of %s begin with %s, which is left out", source, prefix)
+    if prefix != _USUAL:
+        logger.warning("the keys of %s begin with %s, which is left out", source, prefix)
     own = {name: value for name, value in tensors.items() if name not in _COUNTED}
     return {name.removeprefix(prefix): value for name, value in own.items()}
 
@@ -49,7 +56,7 @@ def own_names(tensors: Mapping[str, T], modules: Collection[str], source: str) -
 def own_heads(tensors: Collection[str], config: VGGTConfig, source: str) -> VGGTConfig:
     """Return the configuration with those heads alone that the weights have, and say so; as it is without any."""
     modules = {name.partition(".")[0] for name in tensors}
-    heads = tuple(head for head in config.heads if SOURCES[head] in modules)
+    heads = tuple(head for head in config.heads if SOURCES[config.family][head] in modules)
     if not heads or heads == config.heads:
         return config
     lacking = ", ".join(head for head in config.heads if head not in heads)
@@ -58,7 +65,7 @@ def own_heads(tensors: Collection[str], config: VGGTConfig, source: str) -> VGGT
 
 
 def _prefix(name: str, modules: Collection[str]) -> str | None:
-    """Return what stands before the first of VGGT's modules in a name, None where there is none."""
+    """Return what stands before the first of the modules in a name, None where there is none."""
     words = name.split(".")
     place = next((place for place, word in enumerate(words) if word in modules), None)
     prefix = None if place is None else "".join(f"{word}." for word in words[:place])

@@ -124,8 +124,8 @@ def test_the_network_loads_no_library_of_the_command_line():
 
 
 def test_an_upward_import_and_a_circle_are_found(graph, layer):
-    worse = graph | {"vggtjax.network.rope": {"vggtjax.method.mask"}}
-    assert upward(worse, layer) == ["vggtjax.network.rope -> vggtjax.method.mask"]
+    worse = graph | {"vggtjax.network.positions": {"vggtjax.method.mask"}}
+    assert upward(worse, layer) == ["vggtjax.network.positions -> vggtjax.method.mask"]
     assert "vggtjax.errors" in circle(graph | {"vggtjax.errors": {"vggtjax.cameras"}})
 
 

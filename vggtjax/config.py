@@ -7,7 +7,7 @@ import hashlib
 import json
 import math
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from msgspec import Meta
 
@@ -23,9 +23,11 @@ ComputeDType = Literal["float32", "bfloat16", "float64"]
 Precision = Literal["highest", "tf32"]
 Threshold = Literal["otsu", "multi-otsu"]
 Witness = Literal["gram", "matches"]  # of motion
+Reference = Literal["chosen", "first", "middle"]
+FamilyName = Literal["vggt", "da3"]
 _MATCHING = (0.5, 0.65)  # relative depths of the pairs that match, where no others are named
 VGGT_HEADS = ("camera", "depth", "points", "tracks")  # of the published weights
-HEAD_NAMES = VGGT_HEADS  # all heads that the network knows, in the order of `VGGTConfig.heads`
+HEAD_NAMES = (*VGGT_HEADS, "rays")  # all heads that the network knows, in the order of `VGGTConfig.heads`
 
 
 @dataclass(frozen=True)
@@ -129,12 +131,57 @@ class MotionConfig:
         return given or self.threshold or own
 
 
+@dataclass(frozen=True)
+class Family:
+    """What tells the networks of one family from those of another, beside their sizes: a row of `FAMILIES`."""
+
+    heads: tuple[str, ...]  # that it can have
+    registers: int  # tokens of each frame beside its camera token and its patches
+    clip_size: int  # pixels a side of frames by default, at most
+    block_epsilon: float  # of the norms of a pair's blocks
+    norms_features: bool  # the backbone's last norm is for its features; else for the taps, in their global half
+    flat_positions: bool  # in global blocks all patches rotate alike; else by their place in the frame
+    places_by_scale: bool  # how the table of positions is resized: by a scale, sharply; else by size, with antialias
+    chooses_reference: bool  # the frame with the first camera token; else the clip's first frame
+    takes_cameras: bool  # as camera tokens
+    relu_in_place: bool  # skips of the dense heads add relu(x); else x
+    direct_cameras: bool  # camera-to-world, from a camera token alone; else camera-from-world, by iterations
+
+
+FAMILIES = {
+    "vggt": Family(
+        VGGT_HEADS,
+        registers=4,
+        clip_size=LARGEST,
+        block_epsilon=1e-5,
+        norms_features=True,
+        flat_positions=False,
+        places_by_scale=False,
+        chooses_reference=False,
+        takes_cameras=False,
+        relu_in_place=True,
+        direct_cameras=False,
+    ),
+    "da3": Family(
+        ("camera", "depth", "rays"),
+        registers=0,
+        clip_size=504,
+        block_epsilon=1e-6,
+        norms_features=False,
+        flat_positions=True,
+        places_by_scale=True,
+        chooses_reference=True,
+        takes_cameras=True,
+        relu_in_place=False,
+        direct_cameras=True,
+    ),
+}
 _LATER = {name: getattr(MotionConfig, name) for name in ("floor", "mask_pairs", "threshold", "matching")}
 
 
 @dataclass(frozen=True)
 class VGGTConfig:
-    """Architecture of a VGGT model (arXiv 2503.11651). The defaults are VGGT-1B.
+    """Architecture of a VGGT (arXiv 2503.11651) or Depth Anything 3 (arXiv 2511.10647). The defaults are VGGT-1B.
 
     The shapes in a checkpoint do not tell the numbers of heads, so a model of another size needs its configuration.
     """
@@ -158,19 +205,23 @@ class VGGTConfig:
     track_position_embedding: bool = False
     heads: tuple[str, ...] = VGGT_HEADS  # of the model; a conversion can omit some
     motion: MotionConfig = field(default_factory=MotionConfig)
+    family: FamilyName = "vggt"
+    gated_mlp: Annotated[int, Meta(ge=0, le=LARGEST)] = 0  # hidden channels of the blocks' SwiGLU; 0: GELU with 4 C
+    leading_global: bool = False  # whether one global block comes before the pairs
 
     def __post_init__(self) -> None:
         check_fields(self)
-        if unknown := [name for name in self.heads if name not in HEAD_NAMES]:
-            raise InputError(f"heads has {unknown}; expected some of {HEAD_NAMES}")
-        if not self.heads or self.heads != tuple(name for name in HEAD_NAMES if name in self.heads):
-            raise InputError(f"heads is {self.heads}; expected at least one of {HEAD_NAMES}, in this order")
+        if unknown := [name for name in self.heads if name not in self.row.heads]:
+            raise InputError(f"heads has {unknown}; expected some of {self.row.heads}")
+        known = self.row.heads
+        if not self.heads or self.heads != tuple(name for name in known if name in self.heads):
+            raise InputError(f"heads is {self.heads}; expected at least one of {known}, in this order")
         if self.image_size % self.patch_size:
             raise InputError(f"image_size {self.image_size} is not a multiple of patch_size {self.patch_size}")
         for channels, heads, multiple in (
             ("embed_dim", "num_heads", 4),  # rotary embedding: quarters for sin and cos of y and of x
             ("embed_dim", "dino_num_heads", 1),
-            ("tap_dim", "camera_num_heads", 1),
+            ("embed_dim" if self.row.takes_cameras else "tap_dim", "camera_num_heads", 1),
         ):
             width, count = getattr(self, channels), getattr(self, heads)
             if width % (multiple * count):
@@ -184,6 +235,21 @@ class VGGTConfig:
                 f"taps is {self.taps}; expected four rising indices of pairs below depth {self.depth}, so depth is at "
                 "least 4"
             )
+
+    @property
+    def row(self) -> Family:
+        """The row of the model's family."""
+        return FAMILIES[self.family]
+
+    @property
+    def special_tokens(self) -> int:
+        """Tokens of each frame before its patches, in the pairs of blocks: a camera token and registers."""
+        return 1 + self.row.registers
+
+    @property
+    def clip_size(self) -> int:
+        """Pixels a side of frames, unless others are asked for."""
+        return min(self.image_size, self.row.clip_size)
 
     @property
     def tap_dim(self) -> int:
@@ -201,7 +267,7 @@ class VGGTConfig:
         A floor of 0, the papers' number of pairs, no threshold and no matching pairs are left out, as in files before
         them: digests and cached conversions stay the same.
         """
-        values = dataclasses.asdict(self)
+        values = without_defaults(dataclasses.asdict(self), _LATER_SIZES)
         values["motion"] = without_defaults(values["motion"], _LATER)
         return json.dumps(values, separators=(",", ":"))
 
@@ -211,6 +277,39 @@ class VGGTConfig:
         return parse_json(text, cls, "configuration")
 
 
+_LATER_SIZES = {name: getattr(VGGTConfig, name) for name in ("family", "gated_mlp", "leading_global")}
+
+
 def vggt_1b() -> VGGTConfig:
     """Return the configuration of the published VGGT-1B."""
     return VGGTConfig()
+
+
+def _da3(embed_dim: int, encoder: int, taps: tuple, features: int, channels: tuple, **sizes: Any) -> VGGTConfig:
+    """Return the configuration of a Depth Anything 3 with `encoder` blocks before its pairs; the last pair is tapped.
+
+    Its table of motion cues is VGGT-1B's by relative depth, and so is the number of masked pairs: both unmeasured.
+    """
+    heads, depth = embed_dim // 64, taps[-1] + 1
+    return VGGTConfig(
+        embed_dim=embed_dim,
+        depth=depth,
+        num_heads=heads,
+        dino_depth=encoder,
+        dino_num_heads=heads,
+        dpt_features=features,
+        dpt_channels=channels,
+        taps=taps,
+        heads=FAMILIES["da3"].heads,
+        motion=MotionConfig(mask_pairs=round(5 / 24 * depth)),
+        family="da3",
+        **sizes,
+    )
+
+
+DA3 = {  # by the names in the published config.json
+    "da3-small": _da3(384, 4, (0, 1, 2, 3), 64, (48, 96, 192, 384)),
+    "da3-base": _da3(768, 4, (0, 1, 2, 3), 128, (96, 192, 384, 768)),
+    "da3-large": _da3(1024, 8, (1, 3, 5, 7), 256, (256, 512, 1024, 1024)),
+    "da3-giant": _da3(1536, 13, (2, 6, 9, 12), 256, (256, 512, 1024, 1024), gated_mlp=4096, leading_global=True),
+}

@@ -14,6 +14,7 @@ from vggtjax.config import (
     Gram,
     MotionConfig,
     Precision,
+    Reference,
     Suppress,
     Threshold,
     Witness,
@@ -107,6 +108,7 @@ _LATER = {
     "consistent_depth": False,
     "attention": "exact",
     "precision": "highest",
+    "reference": "chosen",
 }  # as in older results
 
 
@@ -144,6 +146,8 @@ class Options:
             seven digits of float32 there and, without --dtype, in the transformer. A CPU always has seven
         attention: how frames attend to each other: exact; sampled, an approximation that sees a third of the tokens of
             other frames: faster for long clips, with other numbers (its errors are in the docs)
+        reference: the frame that Depth Anything 3 looks at first: chosen, the most ordinary one; first or middle, by
+            its place in the clip. VGGT always takes the first
     """
 
     method: MethodName = "4dvggt-d"
@@ -160,6 +164,7 @@ class Options:
     compute_dtype: ComputeDType | None = None
     precision: Precision | None = None
     attention: Attention = "exact"
+    reference: Reference = "chosen"
 
     def __post_init__(self) -> None:
         find_method(self.method)

@@ -206,7 +206,7 @@ def _fusion_gradient(compiler: Compiler, setup: Setup) -> None:
         parameter_shapes(setup.config),
         jax.ShapeDtypeStruct((*shape, 3), jnp.float32),
     )
-    read = passes._replace(patch_tokens=None, tracks=None)
+    read = passes._replace(features=None, tracks=None)
 
     def loss(fusion: Any, read: Passes, truth: Any) -> Any:
         clip = FitClips(jax.tree.map(lambda x: x[0], observe(read)), truth[0])

@@ -11,8 +11,6 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 
 from vggtjax.config import VGGTConfig
-from vggtjax.network.aggregator import SPECIAL_TOKENS
-from vggtjax.network.backbone import REGISTERS
 from vggtjax.network.heads import camera_head as camera
 from vggtjax.network.heads.dpt_head import DENSE_HEADS, HIDDEN
 from vggtjax.network.heads.pose import POSE_SIZE
@@ -50,12 +48,12 @@ def backbone(config: VGGTConfig, S: int, grid: Grid) -> list[Work]:
     """Count DINOv2: the patch embedding and its blocks, frame by frame."""
     C, P = config.embed_dim, grid[0] * grid[1]
     embedding = {"linear": 2 * S * P * 3 * config.patch_size**2 * C}
-    return [embedding, _blocks(config.dino_depth, S, 1 + REGISTERS + P, C, config.dino_num_heads)]
+    return [embedding, _blocks(config.dino_depth, S, 1 + config.row.registers + P, C, config.dino_num_heads)]
 
 
 def alternating(config: VGGTConfig, S: int, grid: Grid) -> list[Work]:
     """Count the pairs of frame and global blocks."""
-    C, T = config.embed_dim, SPECIAL_TOKENS + grid[0] * grid[1]
+    C, T = config.embed_dim, config.special_tokens + grid[0] * grid[1]
     return [_blocks(config.depth, count, tokens, C, config.num_heads) for count, tokens in ((S, T), (1, S * T))]
 
 

@@ -36,7 +36,7 @@ from vggtjax.options import Options
 Images = Float[Array, "B S H W 3"]
 Masks = Bool[Array | np.ndarray, "B S H W"] | Float[Array | np.ndarray, "B S H W"] | SoftMasking | Literal[False] | None
 FIRST_OUTPUTS = ("camera", "depth")
-_CLIPS = ClipBatch(BY_FRAME, BY_FRAME, REPLICATED)  # type: ignore[arg-type] # where its parts are on several devices
+_CLIPS = ClipBatch(BY_FRAME, BY_FRAME, REPLICATED, BY_FRAME)  # type: ignore[arg-type] # where its parts are on several devices
 _Parameters = ParamSpec("_Parameters")
 _Result = TypeVar("_Result")
 
@@ -58,7 +58,7 @@ def inline(name: str, function: Callable[_Parameters, _Result], /) -> Callable[_
     return function
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=("images", "query_points"), meta_fields=("frames",))
+@partial(jax.tree_util.register_dataclass, data_fields=("images", "query_points", "cameras"), meta_fields=("frames",))
 @dataclass(frozen=True)
 class Clips:
     """A batch of clips to reconstruct: a pytree, whose `frames` is static under jit.
@@ -68,11 +68,13 @@ class Clips:
         query_points: x, y in pixels of points to track, by the frame in which they are given.
         frames: number of real frames, the first ones. The others change nothing: they make clips of similar length
             share compiled programs, or shares of devices equal. None: all are real.
+        cameras: known cameras, as pose encodings, for a network that reads them.
     """
 
     images: Images
     query_points: Mapping[int, Float[Array, "B Q 2"]] = field(default_factory=dict)
     frames: int | None = None
+    cameras: Float[Array, "B S 9"] | None = None
 
     @classmethod
     def given(cls, clips: Clips | Images) -> Clips:
@@ -114,7 +116,13 @@ def compute_by(options: Options, frames: Frames = Frames(), on_accelerator: bool
     `on_accelerator` is as for `Options.computed`.
     """
     options = options.computed(on_accelerator)
-    return Compute(str(options.compute_dtype), str(options.precision), attention=options.attention, frames=frames)
+    return Compute(
+        str(options.compute_dtype),
+        str(options.precision),
+        attention=options.attention,
+        reference=options.reference,
+        frames=frames,
+    )
 
 
 def run_method(
@@ -158,7 +166,7 @@ def run_method(
     )
     frames = clips.real(compute.frames)
     join = step("assemble", assemble)
-    arrays = (passes._replace(patch_tokens=None, tracks=None), as_tree(fusion))
+    arrays = (passes._replace(features=None, tracks=None), as_tree(fusion))
     made = join(*arrays, method=options.method, align_scale=options.align_scale, frames=frames)
     return made, passes
 
@@ -202,8 +210,8 @@ def run_passes(
     if shared is None:
         # Features of the backbone, which both passes share.
         features = step("image features", on_devices(encode, REPLICATED, BY_FRAME))
-        tokens = features(params, images, config=config, compute_dtype=compute.compute_dtype, remat=compute.remat)
-        batch = ClipBatch(images, tokens, clips.padding(compute.frames))
+        made = features(params, images, config=config, compute_dtype=compute.compute_dtype, remat=compute.remat)
+        batch = ClipBatch(images, made, clips.padding(compute.frames), clips.cameras)
         # Stage 1: a plain pass, which adds up the similarities of q and k that tell motion.
         exponents = None if soft is None else soft.exponents
         plain_pass = step("first pass", on_devices(first_pass, REPLICATED, _CLIPS, REPLICATED, REPLICATED))
@@ -211,7 +219,7 @@ def run_passes(
         first, seen = plain_pass(*arrays, config=config, gram=method.gram, witness=witness, compute=compute)
     else:
         _check_shared(shared, masks, witness)
-        batch = ClipBatch(images, shared.patch_tokens, clips.padding(compute.frames))
+        batch = ClipBatch(images, shared.features, clips.padding(compute.frames), clips.cameras)
         first, seen = shared.first, Evidence(shared.saliency, shared.matches)
 
     # What moves.
@@ -241,7 +249,7 @@ def run_passes(
         second = masked_pass(*arrays, config=config, suppress=method.suppress, outputs=outputs, compute=compute)
 
     tracks = _follow(params, batch, clips.query_points, first, config, compute, step) if clips.query_points else None
-    return Passes(first, second, seen.saliency, *moving, seen.matches, batch.patch_tokens, tracks)
+    return Passes(first, second, seen.saliency, *moving, seen.matches, batch.features, tracks)
 
 
 def _follow(
@@ -291,8 +299,8 @@ def check_masks(masks: Masks, images: Images, frames: Frames = Frames()) -> None
 
 def _check_shared(shared: Passes, masks: Masks, witness: Witness) -> None:
     """Raise InputError for passes that lack what is read of them."""
-    if shared.patch_tokens is None:
-        raise InputError("shared has no patch tokens; expected what run_passes returned")
+    if shared.features is None:
+        raise InputError("shared has no features; expected what run_passes returned")
     if witness == "matches" and shared.matches is None:
         raise InputError("shared has no matches between frames; run its passes with the same mask")
     if isinstance(masks, SoftMasking):

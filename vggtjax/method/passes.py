@@ -18,7 +18,7 @@ from vggtjax.method.matching.matched_mask import MotionMask, mine_matched_mask
 from vggtjax.method.matching.matches import Matches
 from vggtjax.method.matching.witnesses import Evidence, Witnesses
 from vggtjax.method.soft_mask import SoftMasking, soft_pixels
-from vggtjax.network.backbone import ClipBatch, patch_grid
+from vggtjax.network.backbone import ClipBatch, Features, patch_grid
 from vggtjax.network.heads.track_head import Tracks
 from vggtjax.network.kernels.frames import Frames, with_frames
 from vggtjax.network.layers import Params
@@ -42,7 +42,7 @@ class Passes(NamedTuple):
     motion: Float[Array, "B S h w"] | None = None  # as in `MotionMask`
     is_matched: Bool[Array, "B S"] | None = None  # as in `MotionMask`
     matches: Matches | None = None  # of the first pass, where it gathered them
-    patch_tokens: Float[Array, "B S P C"] | None = None  # of the backbone, which both passes share
+    features: Features | None = None  # of the backbone, which both passes share
     tracks: dict[int, Tracks] | None = None  # by the frame of their query points
 
 
@@ -93,7 +93,7 @@ def mine(
     Args:
         seen: what the first pass sees of motion.
         first: its predictions, which are read where there are matches.
-        clips: images and patch tokens.
+        clips: images and features.
         clusters: as for `mine_mask`, and so is `smooth_frames`.
         threshold: of the Gram saliency.
         smooth_frames: of the Gram saliency.
@@ -104,7 +104,7 @@ def mine(
     seen, first, clips = frames.whole((seen, first, clips._replace(frame_count=None)))
     images, size = clips.images, (clips.images.shape[2], clips.images.shape[3])
     how = {"clusters": clusters, "threshold": threshold, "smooth_frames": smooth_frames}
-    mined = MotionMask(mine_mask(seen.saliency, present(clips.patch_tokens), size, **how))
+    mined = MotionMask(mine_mask(seen.saliency, present(clips.features).patch_tokens, size, **how))
     if seen.matches is not None:
         first = present(first)
         of_first = (present(first.depth), present(first.pose_encoding))
@@ -156,7 +156,7 @@ def second_pass(
 
     Args:
         params: the model's parameter tree.
-        clips: images, patch tokens and numbers of real frames.
+        clips: images, features, numbers of real frames, known cameras.
         dynamic_mask: dynamic pixels, or their shares in [0, 1]. They become the dynamic tokens of the suppression.
         plain: predictions of the first pass.
         mask_pairs, strength: in which pairs keys are suppressed, or how much in each; see `Suppression`.
@@ -196,7 +196,7 @@ def track_from(
 
     Args:
         params: the model's parameter tree.
-        clips: images and patch tokens of the clips, in their order; all frames are real.
+        clips: images and features of the clips, in their order; all frames are real.
         query_points: x, y in pixels of the frame.
         frame: its index (can be traced: one compilation serves all frames with equal numbers of points).
         config: the model's configuration.

@@ -1,4 +1,4 @@
-"""Alternating frame and global attention as one scan over stacked pairs of blocks (VGGT)."""
+"""Alternating frame and global attention as one scan over stacked pairs of blocks (VGGT, Depth Anything 3)."""
 
 from __future__ import annotations
 
@@ -14,18 +14,16 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vggtjax.config import Suppress, VGGTConfig
 from vggtjax.errors import InputError
+from vggtjax.network.backbone import Features
 from vggtjax.network.block import Block, PackedBlock, activations
 from vggtjax.network.kernels.captured import Capture, joined, nothing_captured
 from vggtjax.network.kernels.frames import Frames
 from vggtjax.network.kernels.in_place import replaced_if
 from vggtjax.network.kernels.sampled import early_pairs, frames_alone, sampled_attention
 from vggtjax.network.layers import TABLE, over_layers
+from vggtjax.network.positions import Rope, rope_table
 from vggtjax.network.precision import Compute, upcast
-from vggtjax.network.rope import Rope, rope_table
 from vggtjax.network.suppression import Attend, SuppressedKeys, Suppression, suppressed_attention
-
-REGISTERS = 4
-SPECIAL_TOKENS = 1 + REGISTERS  # camera token, registers
 
 # (S, grid, special tokens) -> attention over the S frames of a clip
 GLOBAL_ATTENTION: Mapping[str, Callable[[int, tuple[int, int], int], Attend]] = {
@@ -90,7 +88,7 @@ class Pair(nn.Module):
     Attributes:
         frame_block, global_block: the two blocks.
         shape: B clips of S frames of T tokens with C channels.
-        rope: the angles of a frame's tokens.
+        rope, global_rope: the angles of a frame's tokens, in each of the two blocks.
         attend: global attention.
         captures, accumulator, frame_count: as of `Aggregator`.
         hidden: tokens whose keys are suppressed, or their shares; None: none.
@@ -103,6 +101,7 @@ class Pair(nn.Module):
     global_block: Block
     shape: tuple[int, int, int, int]
     rope: Rope
+    global_rope: Rope
     attend: Attend
     captures: Sequence[Capture]
     accumulator: Accumulator | None
@@ -121,7 +120,7 @@ class Pair(nn.Module):
         among = partial(among, suppressed=self._suppressed(inputs, B), is_real=self.is_real)
 
         frame, _, _ = self.frame_block(carry.tokens.reshape(B * S, T, C), self.rope, within)
-        x, q, k = self.global_block(frame.reshape(B, S * T, C), self.rope, among)
+        x, q, k = self.global_block(frame.reshape(B, S * T, C), self.global_rope, among)
 
         if self.accumulator is not None:
             q, k = (a.reshape(B, S, T, *a.shape[2:]) for a in (q, k))
@@ -150,10 +149,11 @@ class Aggregator(nn.Module):
     @nn.compact
     def __call__(
         self,
-        patch_tokens: Float[Array, "B S P C"],
+        features: Features,
         grid: tuple[int, int],
         captures: Sequence[Capture],
         *,
+        camera_tokens: Float[Array, "B S C"] | None = None,
         accumulator: Accumulator | None = None,
         frame_count: Int[Array, " B"] | None = None,
         suppression: Suppression = Suppression(),
@@ -162,10 +162,11 @@ class Aggregator(nn.Module):
         """Return the last pair's camera tokens, the captured taps, and the accumulated sums.
 
         Args:
-            patch_tokens: what `encode` returned.
+            features: what `encode` returned.
             grid: rows and columns of patches, h and w.
             captures: one function per entry of `config.taps`, from tokens [B, s, T, 2C] of some frames to any tree of
                 arrays [B, s, ...], each frame by itself. Only these trees are stored, and only of the tapped pairs.
+            camera_tokens: of known cameras, in place of the learned ones.
             accumulator: what to sum over q and k of the global blocks, such as motion cues, or None.
             frame_count: number of real frames of each clip, at least one; padded frames follow and do not change them.
             suppression: the keys to suppress, in both blocks of a pair.
@@ -174,26 +175,42 @@ class Aggregator(nn.Module):
                 what they need of other frames; all else is local.
         """
         config, frames = self.config, compute.frames
-        B, S, P, C = patch_tokens.shape
-        T = SPECIAL_TOKENS + P
+        B, S, P, C = features.patch_tokens.shape
+        T = config.special_tokens + P
         real = frames.are_real(frame_count, B, S)
         if real is not None:  # attention weighs padded values by 0, and 0 x NaN is NaN
-            patch_tokens = jnp.where(real[:, :, None, None], patch_tokens, 0)
-        tokens = self._tokens(upcast(patch_tokens), frames)
+            features = jax.tree.map(lambda x: jnp.where(real.reshape(B, S, *(1,) * (x.ndim - 2)), x, 0), features)
+        tokens = self._tokens(features, camera_tokens, real, compute)
+        ropes = partial(rope_table, grid, config.special_tokens, C // config.num_heads)
+        rope, global_rope = ropes(), ropes(flat=config.row.flat_positions)
 
-        block = partial(PackedBlock, config.num_heads, qk_norm=True, dtype=jnp.dtype(compute.compute_dtype))
+        block = partial(
+            PackedBlock,
+            config.num_heads,
+            qk_norm=True,
+            epsilon=config.row.block_epsilon,
+            gated_mlp=config.gated_mlp,
+            dtype=jnp.dtype(compute.compute_dtype),
+        )
+        attend, is_real = _global_attention(compute, S, grid, config.special_tokens), None
+        if real is not None:
+            is_real = jnp.repeat(real, T, axis=1)
+        if config.leading_global:
+            lead = partial(attend, suppressed=None, is_real=is_real)
+            tokens, _, _ = block(name="leading_block")(tokens.reshape(B, S * T, C), global_rope, lead)
         pairs = over_layers(Pair, config.depth, store=activations(remat=compute.remat))(
             block(name="frame_blocks"),
             block(name="global_blocks"),
             shape=(B, S, T, C),
-            rope=rope_table(grid, SPECIAL_TOKENS, C // config.num_heads),
-            attend=_global_attention(compute, S, grid),
+            rope=rope,
+            global_rope=global_rope,
+            attend=attend,
             captures=captures,
             accumulator=accumulator,
             frame_count=frame_count,
-            hidden=suppression.hidden_tokens(SPECIAL_TOKENS),
+            hidden=suppression.hidden_tokens(config.special_tokens),
             suppress=suppression.suppress,
-            is_real=None if real is None else jnp.repeat(real, T, axis=1),
+            is_real=is_real,
             frames=frames,
         )
         empty = Carry(
@@ -211,24 +228,66 @@ class Aggregator(nn.Module):
         last, _ = pairs(empty, inputs)
         return last.camera, last.taps, last.sums
 
-    def _tokens(self, patch_tokens: Float[Array, "B S P C"], frames: Frames) -> Float[Array, "B S T C"]:
-        """Prepend camera and register tokens: variant 0 for the clip's first frame, variant 1 for all others."""
-        B, S, _, C = patch_tokens.shape
-        camera = self.param("camera_token", TABLE, (2, 1, C))
-        registers = self.param("register_tokens", TABLE, (2, REGISTERS, C))
-        special = jnp.concatenate([camera, registers], axis=1)  # [2, 5, C]
-        special = special.astype(patch_tokens.dtype)[(frames.numbers(S) > 0).astype(int)]  # [S, 5, C]
-        return jnp.concatenate([jnp.broadcast_to(special, (B, S, SPECIAL_TOKENS, C)), patch_tokens], axis=2)
+    def _tokens(
+        self,
+        features: Features,
+        camera_tokens: Float[Array, "B S C"] | None,
+        real: Bool[Array, "B S"] | None,
+        compute: Compute,
+    ) -> Float[Array, "B S T C"]:
+        """Prepend camera and register tokens: variant 0 for the reference frame, variant 1 for all others."""
+        patches, row, frames = upcast(features.patch_tokens), self.config.row, compute.frames
+        B, S, _, C = patches.shape
+        special = self.param("camera_token", TABLE, (2, 1, C))
+        if row.registers:
+            registers = self.param("register_tokens", TABLE, (2, row.registers, C))
+            special = jnp.concatenate([special, registers], axis=1)  # [2, 1 + R, C]
+        is_other = jnp.asarray(frames.numbers(S) > 0)
+        if features.class_tokens is not None:
+            is_other = frames.numbers(S)[None] != reference_frame(features.class_tokens, real, compute)[:, None]  # [B, S]
+        special = special.astype(patches.dtype)[is_other.astype(int)]  # [(B,) S, 1 + R, C]
+        if camera_tokens is not None:
+            special = camera_tokens[:, :, None].astype(patches.dtype)
+        special = jnp.broadcast_to(special, (B, S, self.config.special_tokens, C))
+        return jnp.concatenate([special, patches], axis=2)
 
 
-def _global_attention(compute: Compute, S: int, grid: tuple[int, int]) -> Attend:
+def reference_frame(
+    class_tokens: Float[Array, "B S C"], real: Bool[Array, "B S"] | None = None, compute: Compute = Compute()
+) -> Int[Array, " B"]:
+    """Return the number of each clip's reference frame by `compute.reference`; 0 in clips of one or two frames.
+
+    "chosen" is the most ordinary frame (Depth Anything 3, "saddle_balanced"). Three facts of a class token count, each
+    scaled to [0, 1] over the clip: its mean similarity to the others, its norm, and the variance of its unit vector.
+    The frame whose facts are closest to 0.5 is chosen.
+    """
+    tokens = compute.frames.gather(upcast(class_tokens))
+    real = jnp.ones(tokens.shape[:2], bool) if real is None else compute.frames.gather(real)
+    count = real.sum(axis=1)
+    norm = jnp.linalg.norm(tokens, axis=-1)
+    unit = tokens / jnp.where(norm > 0, norm, 1)[..., None]
+    similarity = jnp.where(real[:, None], jnp.einsum("bsc,btc->bst", unit, unit), 0).sum(axis=-1)
+    others = jnp.maximum(count - 1, 1)[:, None]
+    facts = jnp.stack([(similarity - 1) / others, norm, unit.var(axis=-1)])  # [3, B, S]
+    low = jnp.where(real[None], facts, jnp.inf).min(axis=-1, keepdims=True)
+    high = jnp.where(real[None], facts, -jnp.inf).max(axis=-1, keepdims=True)
+    distance = jnp.abs((facts - low) / (high - low + 1e-8) - 0.5).sum(axis=0)
+    number = {
+        "chosen": jnp.argmin(jnp.where(real, distance, jnp.inf), axis=-1),
+        "first": jnp.zeros_like(count),
+        "middle": count // 2,
+    }[compute.reference]
+    return jnp.where(count < 3, 0, number)
+
+
+def _global_attention(compute: Compute, S: int, grid: tuple[int, int], special_tokens: int) -> Attend:
     """Return attention over S frames of a clip, or over all frames of several devices.
 
     Raises InputError for an approximation on several devices.
     """
     if compute.frames.mesh is None:
         attend = compute.attention if callable(compute.attention) else GLOBAL_ATTENTION[compute.attention]
-        return attend(S, grid, SPECIAL_TOKENS)
+        return attend(S, grid, special_tokens)
     if compute.attention != "exact":
         raise InputError(f"attention is {compute.attention!r} on several devices; expected 'exact', or one device")
     return partial(suppressed_attention, frames=compute.frames)

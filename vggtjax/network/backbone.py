@@ -1,10 +1,9 @@
-"""DINOv2 vision transformer: images -> patch tokens, independent of the dynamic mask."""
+"""DINOv2 vision transformer: images -> features of each frame, independent of the dynamic mask."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Array, Float, Int
@@ -14,20 +13,28 @@ from vggtjax.errors import InputError
 from vggtjax.network.block import BlockLayer, PackedBlock, activations
 from vggtjax.network.given import as_images, check_floats
 from vggtjax.network.layers import TABLE, Conv, LayerNorm, Params, over_layers
+from vggtjax.network.positions import patch_positions
 from vggtjax.network.precision import check_compute_dtype, full_precision, upcast
 
 IMAGE_MEAN = (0.485, 0.456, 0.406)
 IMAGE_STD = (0.229, 0.224, 0.225)
-REGISTERS = 4
 _EPSILON = 1e-6
+
+
+class Features(NamedTuple):
+    """What the backbone makes of each frame; both passes share it."""
+
+    patch_tokens: Float[Array, "B S P C"]  # in row-major patch order
+    class_tokens: Float[Array, "B S C"] | None = None  # before the last block, where they choose the reference frame
 
 
 class ClipBatch(NamedTuple):
     """Images of a batch of clips, and what travels with them through every pass."""
 
     images: Float[Array, "B S H W 3"]  # RGB in [0, 1]
-    patch_tokens: Float[Array, "B S P C"] | None = None  # what `encode` returned; a pass without them computes them
+    features: Features | None = None  # what `encode` returned; a pass without them computes them
     frame_count: Int[Array, " B"] | None = None  # real frames of each clip, its first ones, at least one; None: all
+    cameras: Float[Array, "B S 9"] | None = None  # known ones, as pose encodings; the network reads them
 
 
 @full_precision()
@@ -38,8 +45,8 @@ def encode(
     *,
     compute_dtype: str = "float32",
     remat: bool = False,
-) -> Float[Array, "B S P C"]:
-    """Return the backbone's normalised patch tokens.
+) -> Features:
+    """Return the backbone's features of each frame.
 
     Args:
         params: the model's parameter tree (`backbone` is read).
@@ -49,7 +56,8 @@ def encode(
         remat: store only the input of every block for the gradient, and compute its activations again.
 
     Returns:
-        Tokens in row-major patch order, in float32 (float64 for compute_dtype "float64"). Both passes share them.
+        Patch tokens, and class tokens where they choose the reference frame, in float32 (float64 for compute_dtype
+        "float64"). Both passes share them.
 
     Raises:
         InputError: an invalid shape or type of the images, or an unknown compute_dtype.
@@ -69,9 +77,9 @@ class Backbone(nn.Module):
     remat: bool = False
 
     @nn.compact
-    def __call__(self, images: Float[Array, "B S H W 3"]) -> Float[Array, "B S P C"]:
-        """Return the patch tokens after the last norm."""
-        config, dtype = self.config, jnp.dtype(self.compute_dtype)
+    def __call__(self, images: Float[Array, "B S H W 3"]) -> Features:
+        """Return the features of each frame."""
+        config, row, dtype = self.config, self.config.row, jnp.dtype(self.compute_dtype)
         C, size, side = config.embed_dim, config.patch_size, config.grid_size
         B, S, H, W, _ = images.shape
         grid = (H // size, W // size)
@@ -79,15 +87,27 @@ class Backbone(nn.Module):
         embed = Conv(C, (size, size), strides=size, padding="VALID", dtype=dtype, name="patch_embedding")
         x = upcast(embed(x.reshape(B * S, H, W, 3))).reshape(B * S, grid[0] * grid[1], C)
         positions = self.param("position_embedding", TABLE, (1 + side**2, C)).astype(x.dtype)
-        x = x + patch_positions(positions[1:], side, grid)[None]
-        class_token = self.param("class_token", TABLE, (1, C))
-        registers = self.param("register_tokens", TABLE, (REGISTERS, C))
-        special = jnp.concatenate([class_token + positions[:1], registers]).astype(x.dtype)  # [1 + R, C]
+        x = x + patch_positions(positions[1:], side, grid, by_scale=row.places_by_scale)[None]
+        special = self.param("class_token", TABLE, (1, C)) + positions[:1]
+        if row.registers:
+            registers = self.param("register_tokens", TABLE, (row.registers, C))
+            special = jnp.concatenate([special, registers])
+        special = special.astype(x.dtype)  # [1 + R, C]
         x = jnp.concatenate([jnp.broadcast_to(special, (B * S, *special.shape)), x], axis=1)  # [B*S, 1 + R + P, C]
-        block = PackedBlock(config.dino_num_heads, epsilon=_EPSILON, dtype=dtype, layer_scale=1.0, name="blocks")
-        x, _ = over_layers(BlockLayer, config.dino_depth, store=activations(remat=self.remat))(block)(x)
-        x = LayerNorm(_EPSILON, name="norm")(x)
-        return x[:, 1 + REGISTERS :].reshape(B, S, grid[0] * grid[1], C)
+        block = PackedBlock(
+            config.dino_num_heads,
+            epsilon=_EPSILON,
+            dtype=dtype,
+            layer_scale=1.0,
+            gated_mlp=config.gated_mlp,
+            name="blocks",
+        )
+        layers = over_layers(BlockLayer, config.dino_depth, store=activations(remat=self.remat))
+        x, class_tokens = layers(block, returns_first=row.chooses_reference)(x)
+        if row.norms_features:
+            x = LayerNorm(_EPSILON, name="norm")(x)
+        patches = x[:, 1 + row.registers :].reshape(B, S, grid[0] * grid[1], C)
+        return Features(patches, class_tokens[-1].reshape(B, S, C) if row.chooses_reference else None)
 
 
 def patch_grid(images: Float[Array, "B S H W 3"], config: VGGTConfig) -> tuple[int, int]:
@@ -101,12 +121,3 @@ def patch_grid(images: Float[Array, "B S H W 3"], config: VGGTConfig) -> tuple[i
     if H % size or W % size:
         raise InputError(f"images are {H} x {W} pixels; expected multiples of the patch size {size}")
     return H // size, W // size
-
-
-def patch_positions(table: Float[Array, "G C"], side: int, grid: tuple[int, int]) -> Float[Array, "P C"]:
-    """Resize the learned square grid of positions to `grid`: bicubic with antialias, as DINOv2."""
-    if grid == (side, side):
-        return table
-    C = table.shape[-1]
-    table = jax.image.resize(table.reshape(side, side, C), (*grid, C), "cubic", antialias=True)
-    return table.reshape(grid[0] * grid[1], C)

@@ -15,7 +15,7 @@ from vggtjax.network.kernels.cpu_attention import ATTENDED
 from vggtjax.network.kernels.pieces import map_chunks, map_chunks_in_place
 from vggtjax.network.kernels.quantised import as_multiplied
 from vggtjax.network.layers import MLP, Dense, DType, LayerNorm, constant
-from vggtjax.network.rope import Rope, apply_rope
+from vggtjax.network.positions import Rope, apply_rope
 
 _STORED = jax.checkpoint_policies.save_from_both_policies(
     jax.checkpoint_policies.dots_with_no_batch_dims_saveable, jax.checkpoint_policies.save_only_these_names(ATTENDED)
@@ -76,6 +76,7 @@ class Block(nn.Module):
     epsilon: float = 1e-5
     dtype: DType = jnp.float32
     layer_scale: float = 0.01  # at the start
+    gated_mlp: int = 0  # hidden channels of SwiGLU; 0: GELU with 4 C
 
     @nn.compact
     def __call__(
@@ -95,7 +96,8 @@ class Block(nn.Module):
         projections = Projections(self.num_heads, C, self.qk_norm, self.dtype, name="attention")
         norm1, norm2 = (LayerNorm(self.epsilon, dtype=self.dtype, name=name) for name in ("norm1", "norm2"))
         scale1, scale2 = (self.param(name, constant(self.layer_scale), (C,)) for name in ("scale1", "scale2"))
-        mlp = MLP(4 * C, C, self.dtype, name="mlp")
+        hidden = {"gated": True, "hidden": self.gated_mlp} if self.gated_mlp else {"hidden": 4 * C}
+        mlp = MLP(features=C, dtype=self.dtype, name="mlp", **hidden)
 
         def before(rows, count):
             x, place = rows
@@ -125,7 +127,8 @@ class BlockLayer(nn.Module):
 
     block: Block
     attend: Callable[[Array, Array, Array], Array] = attention
+    returns_first: bool = False
 
-    def __call__(self, x: Float[Array, "B L C"], _: None = None) -> tuple[Float[Array, "B L C"], None]:
-        """Return the tokens after the block."""
-        return self.block(x, attend=self.attend)[0], None
+    def __call__(self, x: Float[Array, "B L C"], _: None = None) -> tuple[Float[Array, "B L C"], Array | None]:
+        """Return the tokens after the block, and perhaps the first token of each sequence before it."""
+        return self.block(x, attend=self.attend)[0], x[:, 0] if self.returns_first else None

@@ -121,17 +121,22 @@ class LayerNorm(nn.LayerNorm):
 
 
 class MLP(nn.Module):
-    """Dense, GELU, dense."""
+    """Dense, GELU, dense; if `gated`, SwiGLU: silu(first half) times second half between the two."""
 
     hidden: int
     features: int
+    gated: bool = False
     dtype: DType = None  # as of `Dense`
     gain: float = 1.0  # of the last kernel's start
     bias_start: Mean = 0.0  # of the last bias
 
     @nn.compact
     def __call__(self, x: Float[Array, "... C"]) -> Float[Array, "... F"]:
-        x = Dense(self.hidden, dtype=self.dtype, activate=True, name="fc1")(x)
+        if self.gated:
+            gate, x = jnp.split(Dense(2 * self.hidden, dtype=self.dtype, name="fc1")(x), 2, axis=-1)
+            x = nn.silu(gate) * x
+        else:
+            x = Dense(self.hidden, dtype=self.dtype, activate=True, name="fc1")(x)
         return Dense(self.features, dtype=self.dtype, gain=self.gain, bias_start=self.bias_start, name="fc2")(x)
 
 

@@ -16,14 +16,17 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vggtjax.config import Suppress, VGGTConfig
 from vggtjax.errors import InputError
-from vggtjax.network.aggregator import SPECIAL_TOKENS, Accumulator, Aggregator, identity
-from vggtjax.network.backbone import Backbone, ClipBatch, encode, patch_grid
+from vggtjax.network.aggregator import Accumulator, Aggregator, identity
+from vggtjax.network.backbone import Backbone, ClipBatch, Features, encode, patch_grid
 from vggtjax.network.given import as_array, as_images, check_floats
-from vggtjax.network.heads.camera_head import CameraHead, predict_pose
+from vggtjax.network.heads.camera_encoder import CameraEncoder, encode_cameras
+from vggtjax.network.heads.camera_head import camera_head, predict_pose
 from vggtjax.network.heads.dpt_head import DENSE_HEADS, DenseHead, predict_dense, project_tap
+from vggtjax.network.heads.pose import POSE_SIZE
+from vggtjax.network.heads.ray_head import RayHead, predict_rays
 from vggtjax.network.heads.track_head import TrackHead, check_track_size, predict_tracks, smallest_side
 from vggtjax.network.kernels.frames import Frames
-from vggtjax.network.layers import Params, Start
+from vggtjax.network.layers import LayerNorm, Params, Start
 from vggtjax.network.precision import Compute, full_precision
 from vggtjax.network.suppression import Suppression
 
@@ -32,11 +35,13 @@ HEADS = {
     "camera": "camera_head",
     **{name: head.module for name, head in DENSE_HEADS.items()},
     "tracks": "track_head",
+    "rays": "ray_head",
 }
 FIELDS = {
     "camera": ("pose_encoding",),
     **{name: head.fields for name, head in DENSE_HEADS.items()},
     "tracks": ("tracks", "track_visibility", "track_confidence"),
+    "rays": ("rays", "rays_confidence"),
 }
 
 
@@ -51,6 +56,8 @@ class Predictions(NamedTuple):
     tracks: Float[Array, "B S Q 2"] | None = None
     track_visibility: Float[Array, "B S Q"] | None = None
     track_confidence: Float[Array, "B S Q"] | None = None
+    rays: Float[Array, "B S 8h 8w 6"] | None = None  # world direction and origin
+    rays_confidence: Float[Array, "B S 8h 8w"] | None = None
     cue_sums: Any = None  # of the accumulator
 
 
@@ -66,6 +73,7 @@ class ForwardChanges(TypedDict, total=False):
     precision: str
     remat: bool
     attention: str
+    reference: str
     frames: Frames
 
 
@@ -74,15 +82,16 @@ def forward(
     images: Float[Array, "B S H W 3"],
     config: VGGTConfig,
     *,
-    patch_tokens: Float[Array, "B S P C"] | None = None,
+    features: Features | None = None,
     frame_count: Int[Array, " B"] | None = None,
+    cameras: Float[Array, "B S 9"] | None = None,
     outputs: Sequence[str] = ("camera", "depth"),
     query_points: Float[Array, "B Q 2"] | None = None,
     cues: Accumulator | None = None,
     suppression: Suppression = Suppression(),
     **changes: Unpack[ForwardChanges],
 ) -> Predictions:
-    """Run VGGT on clips, optionally with the keys of dynamic tokens suppressed.
+    """Run the network on clips, optionally with the keys of dynamic tokens suppressed.
 
     Pure: works under jit, grad, vmap and remat, and never donates.
 
@@ -90,11 +99,12 @@ def forward(
         params: the model's parameter tree.
         images: RGB in [0, 1], any number of frames; H and W are multiples of the patch size.
         config: the model's configuration (static under jit).
-        patch_tokens: what `encode` returned for these images; computed here if None.
+        features: what `encode` returned for these images; computed here if None.
         frame_count: for clips of different lengths in one batch: number of real frames of each clip, its first ones, at
             least one. The other frames do not influence them. Not with "tracks"; with `cues`, every real frame needs a
             source at the cues' offsets (four frames are enough by default).
-        outputs: any of "camera", "depth", "points", "tracks".
+        cameras: known cameras of all frames, as pose encodings (`encode_pose`), for a family that reads them.
+        outputs: any of "camera", "depth", "points", "tracks", "rays".
         query_points: x, y in pixels of the first frame, the points to track; required with "tracks", invalid without.
         cues: motion cues, or another accumulator, whose sums become `.cue_sums`.
         suppression: the keys to suppress; none for the plain pass.
@@ -114,7 +124,8 @@ def forward(
     for name in masking.keys() & {"dynamic_tokens", "strength"}:
         masking[name] = masking[name] if masking[name] is None else as_array(name, masking[name])
     query_points = query_points if query_points is None else as_array("query_points", query_points)
-    clips = ClipBatch(as_images(images), patch_tokens, frame_count)
+    cameras = cameras if cameras is None else as_array("cameras", cameras)
+    clips = ClipBatch(as_images(images), features, frame_count, cameras)
     suppression, compute = dataclasses.replace(suppression, **masking), Compute(**computing)
     options = {"outputs": outputs, "query_points": query_points, "accumulator": cues}
     return predict(params, clips, config, **options, suppression=suppression, compute=compute)
@@ -140,15 +151,18 @@ def predict(
     _check(params, grid, clips, config, outputs)
     suppression.check((*clips.images.shape[:2], *grid), config.depth)
     _check_queries(clips, config, outputs, query_points)
-    patch_tokens = clips.patch_tokens
-    if patch_tokens is None:
-        patch_tokens = encode(params, clips.images, config, compute_dtype=compute.compute_dtype, remat=compute.remat)
-    tapped = [HEADS[name] for name in outputs if name != "camera"]
+    features, dtype = clips.features, compute.compute_dtype
+    if features is None:
+        features = encode(params, clips.images, config, compute_dtype=dtype, remat=compute.remat)
+    known = None
+    if clips.cameras is not None:
+        known = encode_cameras(params, clips, config, compute_dtype=dtype, frames=compute.frames)
+    tapped = {"depth_head" if name == "rays" else HEADS[name] for name in outputs if name != "camera"}
     stored = jnp.dtype(compute.compute_dtype)  # taps in bfloat16 add nothing to the error of blocks in bfloat16
 
     def capture(slot: int):
         def projected(tokens: Float[Array, "B S T E"]) -> dict[str, Array]:
-            patches = tokens[:, :, SPECIAL_TOKENS:]
+            patches = tap_patches(params, tokens, config)
             taps = {head: project_tap(params[head], patches, slot, config, compute.precision) for head in tapped}
             return {head: tap.astype(stored) for head, tap in taps.items()}
 
@@ -156,9 +170,10 @@ def predict(
 
     camera_tokens, taps, sums = Aggregator(config).apply(  # type: ignore[misc]
         {"params": params["aggregator"]},
-        patch_tokens,
+        features,
         grid,
         [capture(slot) for slot in range(len(config.taps))],
+        camera_tokens=known,
         accumulator=accumulator,
         frame_count=clips.frame_count,
         suppression=suppression,
@@ -177,6 +192,8 @@ def predict(
                 frames=compute.frames,
             )
             return (pose,)
+        if name == "rays":
+            return predict_rays(params, [tap["depth_head"] for tap in taps], config, grid, compute.precision)
         head, projected = params[HEADS[name]], [tap[HEADS[name]] for tap in taps]
         if name == "tracks":
             return predict_tracks(head, projected, query_points, config, grid)  # type: ignore[arg-type]
@@ -188,6 +205,15 @@ def predict(
     for name in (name for name in HEADS if name in outputs):
         fields |= zip(FIELDS[name], made_by(name), strict=True)
     return Predictions(**fields)
+
+
+def tap_patches(params: Params, tokens: Float[Array, "B S T E"], config: VGGTConfig) -> Float[Array, "B S P E"]:
+    """Return the patches of a tap, E = 2C, as the dense heads read them."""
+    patches = tokens[:, :, config.special_tokens :]
+    if config.row.norms_features:
+        return patches
+    own, joint = jnp.split(patches, 2, axis=-1)  # after the frame block, after the global block
+    return jnp.concatenate([own, LayerNorm().apply({"params": params["tap_norm"]}, joint)], axis=-1)  # type: ignore
 
 
 def parameter_shapes(config: VGGTConfig) -> Params:
@@ -207,14 +233,22 @@ def _declared(config: VGGTConfig) -> Params:
 
         images = jnp.zeros((1, 1, size, size, 3))
         patches, taps = (jnp.zeros((1, 1, side * side, width)) for width in (config.embed_dim, config.tap_dim))
+        features = Features(patches, patches[:, :, 0])
         heads = {
-            "camera": lambda: declared(CameraHead(config), taps[:, :, 0]),
+            "camera": lambda: declared(camera_head(config), taps[:, :, 0]),
             **{name: partial(declared, DenseHead(config, name), taps, grid, method="declare") for name in DENSE_HEADS},
             "tracks": lambda: declared(TrackHead(config), taps, grid, method="declare"),
+            "rays": lambda: declared(RayHead(config), grid, method="declare"),
         }
+        family = {}
+        if not config.row.norms_features:
+            family["tap_norm"] = declared(LayerNorm(), patches)
+        if config.row.takes_cameras:
+            family["camera_encoder"] = declared(CameraEncoder(config), jnp.zeros((1, 1, POSE_SIZE)))
         return {
             "backbone": declared(Backbone(config), images),
-            "aggregator": declared(Aggregator(config), patches, grid, [identity] * len(config.taps)),
+            "aggregator": declared(Aggregator(config), features, grid, [identity] * len(config.taps)),
+            **family,
             **{HEADS[name]: heads[name]() for name in config.heads},
         }
 
@@ -242,8 +276,14 @@ def init_params(seed: int, config: VGGTConfig) -> Params:
 def _check(params: Params, grid: tuple[int, int], clips: ClipBatch, config: VGGTConfig, outputs: Sequence[str]) -> None:
     check_floats(clips.images)
     tokens_shape = (*clips.images.shape[:2], grid[0] * grid[1], config.embed_dim)
-    if clips.patch_tokens is not None and tuple(clips.patch_tokens.shape) != tokens_shape:
-        raise InputError(f"patch_tokens have shape {tuple(clips.patch_tokens.shape)}; expected {tokens_shape}")
+    patch_tokens = None if clips.features is None else clips.features.patch_tokens
+    if patch_tokens is not None and tuple(patch_tokens.shape) != tokens_shape:
+        raise InputError(f"features have patch tokens of shape {tuple(patch_tokens.shape)}; expected {tokens_shape}")
+    if clips.cameras is not None:
+        if not config.row.takes_cameras:
+            raise InputError(f"cameras are given, and a network of the family {config.family!r} reads none")
+        if tuple(clips.cameras.shape) != (*tokens_shape[:2], POSE_SIZE):
+            raise InputError(f"cameras have shape {clips.cameras.shape}; expected {(*tokens_shape[:2], POSE_SIZE)}")
     if clips.frame_count is not None and tuple(clips.frame_count.shape) != tokens_shape[:1]:
         raise InputError(f"frame_count has shape {tuple(clips.frame_count.shape)}; expected {tokens_shape[:1]}")
     if absent := [name for name in outputs if name not in config.heads]:

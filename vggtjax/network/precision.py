@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from vggtjax.config import Attention, ComputeDType, Precision
+from vggtjax.config import Attention, ComputeDType, Precision, Reference
 from vggtjax.errors import InputError, check_choice
 from vggtjax.network.kernels.frames import Frames
 
@@ -32,6 +32,8 @@ class Compute:
             VGGT's training.
         attention: how global attention is computed: "exact", "sampled" (an approximation, see
             `network.kernels.sampled`), or a function (S, grid, special tokens) -> attention, as an experiment.
+        reference: the frame with the first camera token, in families that choose one: "chosen" by their rule, "first"
+            or "middle" of the clip.
         frames: where the frames of the clips are; all here by default, else the call is inside `Frames.on_devices`.
     """
 
@@ -40,11 +42,13 @@ class Compute:
     remat: bool = False
     stop_camera_gradient: bool = True
     attention: str | Callable = "exact"
+    reference: str = "chosen"
     frames: Frames = Frames()
 
     def __post_init__(self) -> None:
         check_compute_dtype(self.compute_dtype)
         check_choice("precision", self.precision, get_args(Precision))
+        check_choice("reference", self.reference, get_args(Reference))
         if not callable(self.attention):
             check_choice("attention", self.attention, get_args(Attention))
 

@@ -121,4 +121,4 @@ def _infer(
     compute = compute_by(options, Frames(mesh, None if mesh is None else frames))
     how = {"masks": False if all_static else masks, "fusion": fusion, "compute": compute}
     assembly, passes = run_method(params, Clips(images, frames=frames), config, options, **how)
-    return assembly, passes._replace(matches=None, patch_tokens=None)
+    return assembly, passes._replace(matches=None, features=None)

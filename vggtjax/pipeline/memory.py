@@ -17,7 +17,6 @@ import jax
 
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
-from vggtjax.network.aggregator import SPECIAL_TOKENS
 from vggtjax.network.heads.dpt_head import HIDDEN, PIXELS_AT_ONCE
 from vggtjax.network.kernels.cpu_attention import LOGITS_OF_ALL_HEADS, chunk_count
 from vggtjax.network.kernels.gathered_attention import GATHERED_AT_ONCE
@@ -103,7 +102,7 @@ def pass_bytes(
     host = on_cpu() if accelerator is None else not accelerator
     rates = _CPU if host else _ACCELERATOR
     share = -(-frames // devices)
-    tokens = SPECIAL_TOKENS + height * width // config.patch_size**2
+    tokens = config.special_tokens + height * width // config.patch_size**2
     rows = rates.rows * tokens * config.embed_dim
     is_short = host and tokens**2 <= LOGITS_OF_ALL_HEADS
     logits = _LOGITS * config.num_heads * tokens**2 if is_short else 0

@@ -246,7 +246,7 @@ def _arguments(
 
 def _on_host(outputs: tuple[Assembly, Passes], frames: int) -> tuple[Assembly, Passes]:
     """Return what the method made on the host, without padded frames and the features of the backbone."""
-    outputs = outputs[0], outputs[1]._replace(patch_tokens=None)
+    outputs = outputs[0], outputs[1]._replace(features=None)
     return jax.tree.map(lambda x: on_host(x)[:, :frames], outputs)
 
 

@@ -11,13 +11,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from vggtjax.config import VGGTConfig
-from vggtjax.network.aggregator import SPECIAL_TOKENS, Aggregator
+from vggtjax.network.aggregator import Aggregator
 from vggtjax.network.backbone import encode, patch_grid
 from vggtjax.network.heads.camera_head import predict_pose
 from vggtjax.network.heads.dpt_head import DENSE_HEADS, predict_dense, project_tap
 from vggtjax.network.heads.pose import quaternion_to_matrix
 from vggtjax.network.layers import LayerNorm, Params
-from vggtjax.network.model import HEADS
+from vggtjax.network.model import HEADS, tap_patches
 from vggtjax.network.precision import Compute, full_precision
 from vggtjax.storage.json_values import Natural, NotNegative, check_fields
 from vggtjax.training.batch import Batch
@@ -98,7 +98,7 @@ def objective(
     def capture(slot: int):
         @jax.checkpoint  # otherwise the scan stores this in every layer
         def captured(tokens: Float[Array, "B S T E"]) -> dict[str, Array]:
-            patches = tokens[:, :, SPECIAL_TOKENS:]
+            patches = tap_patches(model, tokens, config)
             outputs = {name: project_tap(model[HEADS[name]], patches, slot, config) for name in weights.dense}
             if weights.probe or weights.moments:
                 outputs |= {
@@ -113,9 +113,9 @@ def objective(
     compute = Compute(compute_dtype)
 
     def network(model: Params):
-        tokens = encode(model, images, config, compute_dtype=compute_dtype)
+        features = encode(model, images, config, compute_dtype=compute_dtype)
         settings = {"accumulator": matching, "suppression": batch.suppression(config), "compute": compute}
-        return Aggregator(config).apply({"params": model["aggregator"]}, tokens, grid, captures, **settings)
+        return Aggregator(config).apply({"params": model["aggregator"]}, features, grid, captures, **settings)
 
     camera_tokens, taps, sums = (jax.checkpoint(network) if remat else network)(model)
     pose = predict_pose(model, camera_tokens, config, compute_dtype=compute_dtype)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from vggtjax.config import VGGTConfig
 from vggtjax.network.block import BlockLayer, PackedBlock
-from vggtjax.network.heads.pose import POSE_SIZE
+from vggtjax.network.heads.pose import POSE_SIZE, inverted_pose
 from vggtjax.network.kernels.attention import attention
 from vggtjax.network.kernels.frames import Frames
 from vggtjax.network.layers import MLP, ZEROS, Dense, LayerNorm, Params, over_layers, repeated
@@ -42,8 +43,31 @@ def predict_pose(
         compute_dtype: type of the products of the trunk's blocks; by default that of the tokens, as all else.
         frames: where the frames are; every device computes the poses of all frames, which takes little.
     """
-    head = CameraHead(config, stop_gradient, compute_dtype)
+    head = camera_head(config, stop_gradient, compute_dtype)
     return head.apply({"params": params["camera_head"]}, camera_tokens, frame_count, frames)  # type: ignore
+
+
+def camera_head(config: VGGTConfig, stop_gradient: bool = True, compute_dtype: str | None = None) -> nn.Module:
+    """Return the module of the family's camera head."""
+    if config.row.direct_cameras:
+        return CameraDecoder(config)
+    return CameraHead(config, stop_gradient, compute_dtype)
+
+
+class CameraDecoder(nn.Module):
+    """Each frame's camera from its own token, as camera-to-world, inverted (Depth Anything 3)."""
+
+    config: VGGTConfig
+
+    @nn.compact
+    def __call__(self, camera_tokens: Float[Array, "B S E"], *_: Any) -> Float[Array, "B S 9"]:
+        """Return the pose encoding of every frame."""
+        x = camera_tokens
+        for name in ("fc1", "fc2"):
+            x = nn.relu(Dense(self.config.tap_dim, name=name)(x))
+        start = {"translation": (0.0,) * 3, "quaternion": (0.0, 0.0, 0.0, 1.0), "field_of_view": (1.0,) * 2}
+        t, q, fov = (Dense(len(bias), gain=0.1, bias_start=bias, name=name)(x) for name, bias in start.items())
+        return inverted_pose(jnp.concatenate([t, q, nn.relu(fov)], axis=-1))
 
 
 class CameraHead(nn.Module):

@@ -67,26 +67,30 @@ class DepthToSpace(nn.Module):
 
 
 class ResidualUnit(nn.Module):
-    """Two convolutions and a skip that adds relu(x), as in the training of the published weights."""
+    """Two convolutions of relu(x), and a skip that adds x or, as VGGT's published weights were trained, relu(x)."""
+
+    in_place: bool = True
 
     @nn.compact
     def __call__(self, x: Float[Array, "F h w C"]) -> Float[Array, "F h w C"]:
         C = x.shape[-1]
-        x = nn.relu(x)
-        y = nn.relu(Conv3x3(C, name="conv1")(x))
-        return x + Conv3x3(C, name="conv2")(y)
+        positive = nn.relu(x)
+        y = nn.relu(Conv3x3(C, name="conv1")(positive))
+        return (positive if self.in_place else x) + Conv3x3(C, name="conv2")(y)
 
 
 class Fusion(nn.Module):
     """Merge a coarser map with a lateral one, and resize the result."""
+
+    in_place: bool = True  # as of `ResidualUnit`
 
     @nn.compact
     def __call__(
         self, x: Float[Array, "F h w C"], lateral: Float[Array, "F h w C"] | None, size: tuple[int, int]
     ) -> Float[Array, "F H W C"]:
         if lateral is not None:
-            x = x + ResidualUnit(name="residual1")(lateral)
-        x = ResidualUnit(name="residual2")(x)
+            x = x + ResidualUnit(self.in_place, name="residual1")(lateral)
+        x = ResidualUnit(self.in_place, name="residual2")(x)
         x = Dense(x.shape[-1], name="projection")(x)  # 1 x 1: commutes with the resize, and is cheaper before it
         return resize_aligned(x, size)
 
@@ -97,9 +101,13 @@ class DPTFeatures(nn.Module):
     features: int
     out_features: int
     position_embedding: bool = True
+    in_place: bool = True  # as of `ResidualUnit`
 
     @nn.compact
-    def __call__(self, taps: list[Float[Array, "F h w C"]]) -> Float[Array, "F 8h 8w O"]:
+    def __call__(
+        self, taps: list[Float[Array, "F h w C"]], *, only_levels: bool = False
+    ) -> Float[Array, "F 8h 8w O"] | list[Float[Array, "F _ _ G"]]:
+        """Return the map, or its levels alone, from which another head fuses a map of its own."""
         h, w = taps[0].shape[1:3]
         if self.position_embedding:
             taps = [add_positions(tap, aspect=w / h) for tap in taps]
@@ -110,11 +118,18 @@ class DPTFeatures(nn.Module):
             Conv(taps[3].shape[-1], (3, 3), strides=(2, 2), padding=1, name="downsample3")(taps[3]),
         ]
         levels = [Conv3x3(self.features, use_bias=False, name=f"level{i}")(level) for i, level in enumerate(levels)]
-        x = levels[3]
-        for i in (3, 2, 1, 0):
-            size = levels[i - 1].shape[1:3] if i else (2 * x.shape[1], 2 * x.shape[2])
-            x = Fusion(name=f"fusion{i}")(x, levels[i] if i < 3 else None, size)
-        return Conv3x3(self.out_features, name="output")(x)
+        if only_levels:
+            return levels
+        return Conv3x3(self.out_features, name="output")(fuse(levels, in_place=self.in_place))
+
+
+def fuse(levels: list[Float[Array, "F _ _ G"]], *, in_place: bool) -> Float[Array, "F 8h 8w G"]:
+    """Return the fusion of levels, coarse to fine; inside a module, which gets four fusions."""
+    x = levels[3]
+    for i in (3, 2, 1, 0):
+        size = levels[i - 1].shape[1:3] if i else (2 * x.shape[1], 2 * x.shape[2])
+        x = Fusion(in_place, name=f"fusion{i}")(x, levels[i] if i < 3 else None, size)
+    return x
 
 
 class Regression(nn.Module):
@@ -159,7 +174,8 @@ class DenseHead(TapHead):
     def __call__(self, taps: list[Float[Array, "B S P F"]], grid: tuple[int, int]) -> Float[Array, "B S H W O"]:
         """Return values and a confidence logit, before their activation."""
         config, (h, w), p = self.config, grid, self.config.patch_size
-        reassemble = DPTFeatures(config.dpt_features, config.dpt_features // 2, name="features")
+        in_place = config.row.relu_in_place
+        reassemble = DPTFeatures(config.dpt_features, config.dpt_features // 2, in_place=in_place, name="features")
         regress = Regression(DENSE_HEADS[self.kind].channels, name="regression")
 
         def some_frames(taps: list[Float[Array, "n P F"]]) -> Float[Array, "n H W O"]:

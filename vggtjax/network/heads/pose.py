@@ -42,6 +42,14 @@ def encode_pose(
     return jnp.concatenate([camera_from_world[..., 3], quaternion, fov_h[..., None], fov_w[..., None]], axis=-1)
 
 
+def inverted_pose(pose_encoding: Float[Array, "... 9"]) -> Float[Array, "... 9"]:
+    """Return the encoding of the inverse: world-to-camera of camera-to-world, and the other way round."""
+    translation, quaternion = pose_encoding[..., :3], pose_encoding[..., 3:7]
+    inverse = jnp.concatenate([-quaternion[..., :3], quaternion[..., 3:]], axis=-1)
+    moved = -jnp.einsum("...ij,...j->...i", quaternion_to_matrix(inverse), translation)
+    return jnp.concatenate([moved, inverse, pose_encoding[..., 7:]], axis=-1)
+
+
 def quaternion_to_matrix(quaternion: Float[Array, "... 4"]) -> Float[Array, "... 3 3"]:
     """Return the rotation of a quaternion xyzw of any length but 0."""
     x, y, z, w = jnp.moveaxis(quaternion, -1, 0)

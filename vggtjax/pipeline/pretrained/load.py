@@ -84,11 +84,11 @@ def load_weights(
     path = weights.path
     if not is_checkpoint(path):
         stored = "float32" if dtype in (None, "int8") else dtype
-        path = _converted(weights, config or vggt_1b(), stored, progress)
+        path = _converted(weights, config, stored, progress)
     return read_model(path, dtype=dtype, compute_dtype=compute_dtype)
 
 
-def _converted(weights: Weights, config: VGGTConfig, dtype: DType, progress: Progress | None) -> Path:
+def _converted(weights: Weights, config: VGGTConfig | None, dtype: DType, progress: Progress | None) -> Path:
     """Return the conversion of PyTorch weights in the cache; convert them if it is missing or damaged."""
     path = weights.path
     try:
@@ -96,7 +96,8 @@ def _converted(weights: Weights, config: VGGTConfig, dtype: DType, progress: Pro
     except OSError as error:
         reason = f"{error.filename}: {error.strerror}; copy or download {path} again"
         raise CheckpointError(f"cannot read {reason}") from error
-    facts = [VERSION, dtype, config.to_json(), *(f"{file} {stat.st_size} {stat.st_mtime_ns}" for file, stat in stats)]
+    sizes = (config or vggt_1b()).to_json()  # the file tells which published model it is
+    facts = [VERSION, dtype, sizes, *(f"{file} {stat.st_size} {stat.st_mtime_ns}" for file, stat in stats)]
     key = hashlib.sha256("\n".join(facts).encode("utf-8", "surrogateescape")).hexdigest()[:16]
     destination = cache_folder() / f"{re.sub(r'[^A-Za-z0-9_.-]+', '-', weights.name)[:80]}-{key}.safetensors"
     if not _is_whole(destination):

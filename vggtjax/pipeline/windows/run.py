@@ -169,7 +169,7 @@ def tools_of(
         )
 
     def describe(images: Float32[np.ndarray, "F H W 3"]) -> Float32[np.ndarray, "F C"]:
-        return np.asarray(features(jax.device_put(images[None]))[0], np.float32).mean(axis=1)
+        return np.asarray(features(jax.device_put(images[None])).patch_tokens[0], np.float32).mean(axis=1)
 
     def follow(images: Images, starts: Sequence[Start]) -> list[Tracked]:
         frames = jax.device_put(images[None])

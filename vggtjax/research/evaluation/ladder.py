@@ -301,7 +301,7 @@ def _scored(
 ) -> Iterator[LadderRow]:
     mask = np.asarray(passes.dynamic_mask)
     join = Execute()("assemble", _assemble)
-    read = passes._replace(patch_tokens=None, motion=None, is_matched=None, matches=None)
+    read = passes._replace(features=None, motion=None, is_matched=None, matches=None)
     for method, assembly in zip(methods, join(read, methods=methods), strict=True):
         depth, intrinsics = np.asarray(assembly.depth), np.asarray(assembly.intrinsics)
         cameras = np.asarray(assembly.camera_from_world)

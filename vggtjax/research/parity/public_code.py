@@ -15,7 +15,7 @@ from unittest import mock
 import numpy as np
 
 from converters.files import read_state_dict, weight_files
-from converters.rules import IGNORED, RULES
+from converters.rules import IGNORED, rules
 from converters.trained import SOURCES, own_names
 from vggtjax.config import VGGT_HEADS, MotionConfig, VGGTConfig, vggt_1b
 from vggtjax.errors import CheckpointError, problems_sentence
@@ -46,7 +46,7 @@ def build(package: str, config: VGGTConfig) -> Any:
         model = getattr(public, name)()
     for head in VGGT_HEADS:
         if head not in config.heads:
-            setattr(model, SOURCES[head], None)
+            setattr(model, SOURCES["vggt"][head], None)
     return model.eval()
 
 
@@ -62,7 +62,7 @@ def read_weights(path: Path, name: str) -> dict[str, Any]:
     else:
         arrays = read_state_dict(path).tensors
         tensors = {key: torch.from_numpy(np.asarray(a).astype(np.float32, copy=False)) for key, a in arrays.items()}
-    modules = {rule.source.partition(".")[0] for rule in RULES}
+    modules = {rule.source.partition(".")[0] for rule in rules(vggt_1b())}
     return {key: tensor.float() for key, tensor in own_names(tensors, modules, name).items()}
 
 
@@ -71,13 +71,13 @@ def give_weights(model: Any, tensors: dict[str, Any]) -> None:
 
     Weights of heads that the network lacks are left out.
     """
-    lacking = [SOURCES[head] for head in VGGT_HEADS if getattr(model, SOURCES[head], None) is None]
+    lacking = [SOURCES["vggt"][head] for head in VGGT_HEADS if getattr(model, SOURCES["vggt"][head], None) is None]
     used = {name: tensor for name, tensor in tensors.items() if name.partition(".")[0] not in lacking}
     try:
         missing, unknown = model.load_state_dict(used, strict=False, assign=True)
     except RuntimeError as error:  # shapes
         raise CheckpointError(f"the weights do not fit the public code: {error}") from error
-    problems = [f"missing key {name}" for name in sorted(set(missing) - IGNORED)]
+    problems = [f"missing key {name}" for name in sorted(missing) if not IGNORED["vggt"].fullmatch(name)]
     if problems := problems + [f"unknown key {name}" for name in unknown]:
         raise CheckpointError(problems_sentence("the weights do not fit the public code", problems))
 
