@@ -137,6 +137,7 @@ class Family:
 
     heads: tuple[str, ...]  # that it can have
     registers: int  # tokens of each frame beside its camera token and its patches
+    clip_mode: Literal["crop", "fit"]  # how frames are made of pictures by default: see `Framing`
     clip_size: int  # pixels a side of frames by default, at most
     block_epsilon: float  # of the norms of a pair's blocks
     norms_features: bool  # the backbone's last norm is for its features; else for the taps, in their global half
@@ -152,6 +153,7 @@ FAMILIES = {
     "vggt": Family(
         VGGT_HEADS,
         registers=4,
+        clip_mode="crop",
         clip_size=LARGEST,
         block_epsilon=1e-5,
         norms_features=True,
@@ -165,6 +167,7 @@ FAMILIES = {
     "da3": Family(
         ("camera", "depth", "rays"),
         registers=0,
+        clip_mode="fit",
         clip_size=504,
         block_epsilon=1e-6,
         norms_features=False,

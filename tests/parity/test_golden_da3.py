@@ -79,7 +79,9 @@ def test_the_reference_is_chosen_by_class_tokens(name):
     padded = jnp.concatenate([tokens, jnp.full_like(tokens, 7.0)], axis=1)
     is_real = jnp.concatenate([real, ~real], axis=1)
     assert reference_frame(padded, is_real).tolist() == case.arrays["reference/index"].tolist()
-    assert reference_frame(padded, is_real, Compute(reference="middle")).tolist() == [tokens.shape[1] // 2] * len(tokens)
+    assert reference_frame(padded, is_real, Compute(reference="middle")).tolist() == [tokens.shape[1] // 2] * len(
+        tokens
+    )
     assert reference_frame(tokens[:, :2]).tolist() == [0] * len(tokens)
 
 

@@ -102,7 +102,7 @@ def load_clip(
     source: ClipSource,
     *,
     model: Configured | None = None,
-    mode: Mode = "crop",
+    mode: Mode | None = None,
     size: int | None = None,
     patch: int | None = None,
     fps: float | None = None,
@@ -126,7 +126,8 @@ def load_clip(
             that are not images left out; a list keeps its order.
         model: what `load_model` returned: its own size and patch size are taken, but `size` wins where it is given.
         mode: "crop" makes frames `size` wide and cuts the height to at most `size`; "pad" makes the long side `size`
-            and pads the frame with white to a square.
+            and pads the frame with white to a square; "fit" makes the long side `size` and keeps every pixel. By
+            default as the model was trained; "crop" without a model.
         size: width, or side of the square; a multiple of `patch`; the model's own, or VGGT-1B's 518 without a model.
         patch: side of the model's patches; sides of frames are multiples of it. Left out with a model; else 14.
         fps: frames to take per second of a video, by presentation time: of every 1 / fps seconds the first frame.
@@ -147,9 +148,11 @@ def load_clip(
     return read_clip(open_source(source), sampling, fitter, progress)
 
 
-def _fitter(model: Configured | None, mode: Mode, size: int | None, patch: int | None) -> Fitter:
+def _fitter(model: Configured | None, mode: Mode | None, size: int | None, patch: int | None) -> Fitter:
     if model is None:
-        return Fitter(mode, Fitter.size if size is None else size, Fitter.patch if patch is None else patch)
+        return Fitter(
+            mode or Fitter.mode, Fitter.size if size is None else size, Fitter.patch if patch is None else patch
+        )
     config = getattr(model, "config", None)
     if not isinstance(config, VGGTConfig):
         raise InputError(f"model is {one_line(repr(model), 50)}; expected what load_model returned")

@@ -1,4 +1,4 @@
-"""Frames of any size as frames of the model's size, the way VGGT was trained. Does not import jax."""
+"""Frames of any size as frames of the model's size, the way the model was trained. Does not import jax."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from jaxtyping import Float32, UInt8
 from PIL import Image
 
 from vggtjax.clips.media.sampling import Frame
+from vggtjax.clips.sharp_resize import resized
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import ClipError, InputError, check_choice, whole_number
 
-Mode = Literal["crop", "pad"]
+Mode = Literal["crop", "pad", "fit"]
 
 _MOST_PIXELS = 2**26  # of a resized frame, before it is cut: 8192 x 8192
 
@@ -25,21 +26,24 @@ class Framing:
 
     Attributes:
         mode: crop makes frames `size` wide and cuts tall frames above and below to `size`; pad keeps every pixel and
-            pads to a square
+            pads to a square; fit makes the long side `size` and keeps every pixel; by default as the model was trained:
+            crop for VGGT, fit for Depth Anything 3
         size: side in pixels to run at, a multiple of the model's patch size; the model's own size by default
     """
 
-    mode: Mode = "crop"
+    mode: Mode | None = None
     size: int | None = None
 
     def __post_init__(self) -> None:
-        check_choice("mode", self.mode, get_args(Mode))
+        if self.mode is not None:
+            check_choice("mode", self.mode, get_args(Mode))
         if self.size is not None:
             object.__setattr__(self, "size", whole_number("size", self.size, 1))
 
     def fitter(self, config: VGGTConfig) -> Fitter:
         """Return the fitter for a model of this configuration: at its size, unless `size` is given, and its patches."""
-        return Fitter(self.mode, config.image_size if self.size is None else self.size, config.patch_size)
+        size = config.clip_size if self.size is None else self.size
+        return Fitter(self.mode or config.row.clip_mode, size, config.patch_size)
 
 
 @dataclass(frozen=True)
@@ -65,8 +69,13 @@ class Fitter:
 
         Raises ClipError for a picture so narrow or so long that a side becomes 0 or the resized picture huge.
         """
-        # The order of these operations decides how halves round; it is that of VGGT.
-        if self.mode == "crop" or width >= height:
+        whole = None
+        # The order of these operations decides how halves round; it is that of VGGT and, for "fit", Depth Anything 3.
+        if self.mode == "fit":
+            scale = self.size / max(width, height)
+            whole = (round(width * scale), round(height * scale))
+            resized_width, resized_height = (int(side / self.patch + 0.5) * self.patch for side in whole)
+        elif self.mode == "crop" or width >= height:
             resized_width = self.size
             resized_height = round(height * (self.size / width) / self.patch) * self.patch
         else:
@@ -85,6 +94,7 @@ class Fitter:
             cut=(resized_height - frame_size[1]) // 2,
             frame_size=frame_size,
             box=(0, 0, *frame_size),
+            whole=whole,
         )
         return fit.widen(self.size, self.size) if self.mode == "pad" else fit
 
@@ -95,7 +105,7 @@ class Fit:
 
     Sizes are (width, height). The first `cut` rows of the resized picture are removed; the rest fills `box`
     (left, top, right, bottom) of the frame. Continuous coordinates have pixel edges at whole numbers, and
-    source = scale * frame + offset in (x, y).
+    source = scale * frame + offset in (x, y). With a `whole` size, the picture is first resized to it.
     """
 
     source_size: tuple[int, int]
@@ -103,6 +113,7 @@ class Fit:
     cut: int
     frame_size: tuple[int, int]
     box: tuple[int, int, int, int]
+    whole: tuple[int, int] | None = None
 
     @property
     def cut_share(self) -> float:
@@ -134,6 +145,8 @@ class Fit:
         left, top, right, bottom = self.box
         if frame.exact is not None and self.resized_size == self.source_size:
             pixels, white = frame.exact, 1
+        elif self.whole is not None:
+            pixels, white = resized(resized(np.asarray(frame.image), self.whole), self.resized_size), 255
         else:
             pixels, white = np.asarray(frame.image.resize(self.resized_size, Image.Resampling.BICUBIC)), 255
         fitted = np.full((*self.frame_size[::-1], 3), white, pixels.dtype)

@@ -244,7 +244,9 @@ class Aggregator(nn.Module):
             special = jnp.concatenate([special, registers], axis=1)  # [2, 1 + R, C]
         is_other = jnp.asarray(frames.numbers(S) > 0)
         if features.class_tokens is not None:
-            is_other = frames.numbers(S)[None] != reference_frame(features.class_tokens, real, compute)[:, None]  # [B, S]
+            is_other = (
+                frames.numbers(S)[None] != reference_frame(features.class_tokens, real, compute)[:, None]
+            )  # [B, S]
         special = special.astype(patches.dtype)[is_other.astype(int)]  # [(B,) S, 1 + R, C]
         if camera_tokens is not None:
             special = camera_tokens[:, :, None].astype(patches.dtype)

@@ -10,8 +10,9 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Float32
 
+from vggtjax.cameras import world_from_camera
 from vggtjax.clips.clip import Clip
 from vggtjax.clips.fingerprint import source_setting
 from vggtjax.clips.queries import Queries
@@ -22,6 +23,7 @@ from vggtjax.method.assembly import Assembly, FusionRule, as_tree, check_fuses
 from vggtjax.method.mask_refinement import refine_masks
 from vggtjax.method.passes import Passes
 from vggtjax.network.checkpoint import Model, check_finite
+from vggtjax.network.heads.pose import encode_pose
 from vggtjax.network.kernels.frames import BY_FRAME, REPLICATED, Frames
 from vggtjax.network.surroundings import own_settings
 from vggtjax.options import Options
@@ -218,8 +220,10 @@ def _arguments(
     length = padded_frames(frames, model.config.motion.offsets) if is_padded else frames
     padding = shared_length(length, mesh) - frames
 
-    def padded(x: np.ndarray) -> Array:
-        return shard_frames(np.pad(x, ((0, padding), *((0, 0),) * (x.ndim - 1)))[None], mesh)
+    def padded(x: np.ndarray, **mode: Any) -> Array:
+        return shard_frames(np.pad(x, ((0, padding), *((0, 0),) * (x.ndim - 1)), **mode)[None], mesh)
+
+    cameras = read_cameras(inputs) if model.config.row.takes_cameras else None
 
     params, rule = model.params, as_tree(fusion)
     if mesh is not None:
@@ -234,6 +238,7 @@ def _arguments(
             images=padded(clip.images),
             query_points={} if tracks is None else replicate(_points_by_frame(tracks), mesh),
             frames=frames,
+            cameras=None if cameras is None else padded(cameras, mode="edge"),
         ),
         "config": model.config,
         "options": options,
@@ -242,6 +247,15 @@ def _arguments(
         "both_outputs": running.keep_passes,
         "compute": compute_by(options, Frames(mesh, None if mesh is None else length)),
     }
+
+
+def read_cameras(inputs: Inputs) -> Float32[np.ndarray, "S 9"] | None:
+    """Return known cameras as the network reads them: None unless the poses and intrinsics of all frames are known."""
+    given, (height, width) = inputs.geometry, inputs.clip.images.shape[1:3]
+    if given is None or given.poses is None or given.intrinsics is None:
+        return None
+    poses = world_from_camera(np.asarray(given.poses)[:, :3])[:, :3]
+    return np.asarray(encode_pose(jnp.asarray(poses), jnp.asarray(given.intrinsics), (height, width)), np.float32)
 
 
 def _on_host(outputs: tuple[Assembly, Passes], frames: int) -> tuple[Assembly, Passes]:
