@@ -6,6 +6,7 @@ the largest difference, as a share of the largest value.
 
 import json
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -33,16 +34,16 @@ mesh = frames_mesh(8)
 real, found = Frames(mesh, COUNT), {}
 
 
-def mined(evidence, first, tokens, images, how, frames=Frames()):
+def mined(evidence: Any, first: Any, tokens: Any, images: Any, how: dict[str, Any], frames: Frames = Frames()) -> Any:
     return mine(evidence, first, ClipBatch(images, tokens), **how, frames=frames)
 
 
-def compare(method, how, *inputs):
+def compare(method: str, how: dict[str, Any], *inputs: Any) -> Any:
     """Mine a clip on one device, and padded on eight."""
-    alone = jax.jit(lambda *x: mined(*x, how))(*inputs)
+    alone: Any = jax.jit(partial(mined, how=how))(*inputs)
     added = shared_length(COUNT, mesh) - COUNT
     padded = jax.tree.map(lambda x: np.pad(x, ((0, 0), (0, added), *((0, 0),) * (x.ndim - 2)), mode="edge"), inputs)
-    shared = jax.jit(lambda *x: mined(*x, how, real))(*shard_frames(padded, mesh))
+    shared: Any = jax.jit(partial(mined, how=how, frames=real))(*shard_frames(padded, mesh))
     pairs = zip(*map(jax.tree.leaves, (alone, shared)), strict=True)
     is_equal = (
         all(np.allclose(a, b[:, :COUNT], atol=1e-4) for a, b in pairs) and not shared.dynamic_mask[:, COUNT:].any()
@@ -57,7 +58,9 @@ saliency[:, :, :2, 1:3] += 1
 tokens = saliency.reshape(1, -1, 48, 1) + generator.normal(0, 0.01, (1, COUNT, 48, 3)).astype(np.float32)
 pictures = generator.random((1, COUNT, *SIZE, 3)).astype(np.float32)
 for method, options in METHODS.items():
-    compare(method, {"clusters": 0, "threshold": "otsu"} | options, Evidence(saliency), None, tokens, pictures)
+    compare(
+        method, {"clusters": 0, "threshold": "otsu"} | options, Evidence(jnp.asarray(saliency)), None, tokens, pictures
+    )
 
 world = StaticWorld(COUNT)
 moves = np.zeros((COUNT, *GRID), bool)
@@ -69,8 +72,8 @@ pose = np.asarray(encode_pose(world.cameras.camera_from_world, intrinsics, sides
 images = np.random.default_rng(0).random((COUNT, *depth.shape[1:], 3)).astype(np.float32) / 20 + moving[..., None] / 2
 images += np.linspace(0, 0.3, COUNT, dtype=np.float32)[:, None, None, None]  # not one picture many times
 matches = jax.tree.map(lambda x: np.asarray(x)[None], world.matches(moves.reshape(COUNT, -1)))
-evidence = Evidence(np.full((1, *moves.shape), 0.5, np.float32), matches)
-first = Predictions(pose[None], depth[None].astype(np.float32))
+evidence = Evidence(jnp.full((1, *moves.shape), 0.5), matches)
+first = Predictions(jnp.asarray(pose)[None], jnp.asarray(depth, jnp.float32)[None])
 features = np.zeros((1, COUNT, GRID[0] * GRID[1], 3), np.float32)
 how = {"clusters": 0, "threshold": "otsu"}
 alone = compare("4dvggt-m", how, evidence, first, features, images[None].astype(np.float32))

@@ -13,6 +13,7 @@ from hypothesis.extra import numpy as hnp
 from tests.shared.simulated import scattered
 from vggtjax import fuse_depth
 from vggtjax.errors import InputError
+from vggtjax.method.fusion import family
 from vggtjax.method.fusion.family import (
     FEATURES,
     PARTS,
@@ -25,7 +26,6 @@ from vggtjax.method.fusion.family import (
     soft_mask,
     start,
 )
-from vggtjax.method.fusion.rule import family as family
 
 SHAPE = (2, 3, 4)
 fuse = jax.jit(family.fuse)

@@ -116,7 +116,7 @@ class Pair(nn.Module):
         """Return what the next pair receives."""
         (B, S, T, C), frames, sums = self.shape, self.frames, carry.sums
         within = partial(suppressed_attention, suppressed=self._suppressed(inputs, B * S))
-        among = self.attend if inputs.is_early is None else frames_alone(S, self.attend, inputs.is_early)
+        among: Any = self.attend if inputs.is_early is None else frames_alone(S, self.attend, inputs.is_early)
         among = partial(among, suppressed=self._suppressed(inputs, B), is_real=self.is_real)
 
         frame, _, _ = self.frame_block(carry.tokens.reshape(B * S, T, C), self.rope, within)
@@ -126,7 +126,7 @@ class Pair(nn.Module):
             q, k = (a.reshape(B, S, T, *a.shape[2:]) for a in (q, k))
             # Devices that share the frames communicate for attention first, then for cues; in the gradient, cues first.
             x, (q, k) = frames.in_order(x, (q, k))
-            counts = frames.after(inputs.counts, x)
+            counts = frames.after(jnp.asarray(inputs.counts), x)
             sums = self.accumulator.add(sums, counts, q, k, self.frame_count)
         taps = tuple(  # each is changed in its pair alone
             jax.named_scope(f"tap{i}")(replaced_if)(inputs.is_tapped[i], tap, joined(capture, self.shape), frame, x)

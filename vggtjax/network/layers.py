@@ -43,7 +43,9 @@ class Start(struct.PyTreeNode, AxisMetadata[Any]):
         """Return the same start for a stack of layers."""
         return self
 
-    remove_axis = add_axis
+    def remove_axis(self, index: int, params: dict[Any, Any]) -> Start:
+        """Return the same start of one layer."""
+        return self
 
 
 def constant(mean: Mean) -> nn.initializers.Initializer:

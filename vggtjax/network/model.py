@@ -168,7 +168,7 @@ def predict(
 
         return projected
 
-    camera_tokens, taps, sums = Aggregator(config).apply(  # type: ignore[misc]
+    made: Any = Aggregator(config).apply(
         {"params": params["aggregator"]},
         features,
         grid,
@@ -179,6 +179,7 @@ def predict(
         suppression=suppression,
         compute=compute,
     )
+    camera_tokens, taps, sums = made
 
     def made_by(name: str) -> tuple[Array, ...]:
         if name == "camera":

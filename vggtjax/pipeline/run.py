@@ -105,7 +105,8 @@ def reconstruct(
     options = options.resolved(model.config.motion)
     _check(options, running, tracks, fusion, known)
     clip = clip if isinstance(clip, Clip) else open_source(clip)
-    of_source = {} if running.is_part else source_setting(getattr(clip, "source", clip))  # as it is before the work
+    source = clip.source if isinstance(clip, Clip) else clip
+    of_source = {} if running.is_part else source_setting(source)  # as it is before the work
     inputs = read_inputs(model, clip, size=size, masks=masks, tracks=tracks, known=known, on_stage=running.stage)
 
     run = partial(run_method, **_arguments(model, inputs, options, running, fusion))

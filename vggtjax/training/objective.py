@@ -117,7 +117,8 @@ def objective(
         settings = {"accumulator": matching, "suppression": batch.suppression(config), "compute": compute}
         return Aggregator(config).apply({"params": model["aggregator"]}, features, grid, captures, **settings)
 
-    camera_tokens, taps, sums = (jax.checkpoint(network) if remat else network)(model)
+    made: Any = (jax.checkpoint(network) if remat else network)(model)
+    camera_tokens, taps, sums = made
     pose = predict_pose(model, camera_tokens, config, compute_dtype=compute_dtype)
     terms = _camera_terms(pose, truth.pose_encoding, weights)
     metrics = _camera_metrics(pose, truth.pose_encoding)
