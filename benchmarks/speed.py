@@ -81,9 +81,10 @@ def speed(
     public code all heads, as its `from_pretrained` loads them. In what is timed both sides map their weights.
 
     Args:
-        weights: PyTorch weights in VGGT-1B's layout, such as those of make-checkpoint.
+        weights: PyTorch weights in the layout of VGGT-1B or Depth Anything 3, such as those of make-checkpoint.
         converted: the same weights, written by vggtjax convert.
-        peer: checkout of the public code: a folder with the package vggt, and with vggt4d for both passes.
+        peer: checkout of the public code: a folder with the package vggt, and with vggt4d for both passes; or with the
+            package depth_anything_3, and what it imports, for weights of Depth Anything 3.
         frames: numbers of frames of a plain pass.
         both: numbers of frames of both passes; VGGT4D's cues need four.
         height: of a frame, in pixels.
@@ -92,7 +93,8 @@ def speed(
         repeats: timed runs of each, after a warm-up.
         out: JSON file for the figures of every run.
     """
-    for path in (weights, converted, peer / "vggt", *[peer / "vggt4d"] * bool(both)):
+    package = "depth_anything_3" if (peer / "depth_anything_3").exists() else "vggt"
+    for path in (weights, converted, peer / package, *[peer / "vggt4d"] * bool(both)):
         if not path.exists():
             raise InputError(f"{path} does not exist; see --help for the expected file")
     if both and min(both) < 4:

@@ -22,10 +22,12 @@ from unittest import mock
 import numpy as np
 
 from tests.shared.seeded import seeded_images
-from vggtjax.config import vggt_1b
+from vggtjax.config import DA3, vggt_1b
 from vggtjax.research.parity.public_code import add_checkout, build, give_weights, read_weights
 from vggtjax.storage.cores import core_count
 from vggtjax.storage.process_memory import process_bytes
+
+IMAGE_MEAN, IMAGE_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # as the network's, without its imports
 
 Outputs = dict[str, np.ndarray]
 Run = Callable[[str, np.ndarray, np.ndarray | None], Outputs]  # work, images [S, 3, H, W] in [0, 1], mask [S, H, W]
@@ -39,7 +41,7 @@ def ours(weights: Path, dtype: str) -> Run:
     import jax
     import jax.numpy as jnp
 
-    from vggtjax import forward, infer, load_model
+    from vggtjax import decode_pose, forward, infer, load_model
     from vggtjax.method.mask import dynamic_tokens
 
     model = load_model(weights, compute_dtype=None if dtype == "float32" else dtype)
@@ -65,7 +67,10 @@ def ours(weights: Path, dtype: str) -> Run:
             return {"pose_encoding": np.asarray(call(masked, x, jnp.asarray(mask)[None]).pose_encoding[0])}
         if work == "pass":
             made = call(forward, x, outputs=("camera", "depth"))
-            return _outputs(made.pose_encoding, made.depth, made.depth_confidence)
+            poses = made.pose_encoding
+            if model.config.row.direct_cameras:  # which the public code gives as matrices
+                poses = decode_pose(poses, x.shape[2:4])[0]
+            return _outputs(poses, made.depth, made.depth_confidence)
         assembly, passes = call(infer, x, method=work)
         first = passes.first
         if work == "vggt4d":  # the public code's outputs
@@ -144,6 +149,30 @@ def peer(weights: Path, checkout: Path, *, mapped: bool, dtype: str) -> Run:
     return run
 
 
+def da3_peer(weights: Path, checkout: Path, dtype: str) -> Run:
+    """Return a pass of the public code of Depth Anything 3: a folder with its package and what that imports."""
+    sys.path.insert(0, str(checkout))
+    import torch
+    from depth_anything_3.cfg import create_object, load_config  # pyright: ignore[reportMissingImports]
+    from safetensors.torch import load_file
+
+    torch.set_num_threads(core_count())
+    tensors = {name.removeprefix("model."): value for name, value in load_file(weights).items()}
+    width = tensors["backbone.pretrained.camera_token"].shape[-1]
+    name = next(name for name, config in DA3.items() if config.embed_dim == width)
+    model = create_object(load_config(str(checkout / f"depth_anything_3/configs/{name}.yaml"))).eval()
+    model.load_state_dict(tensors, strict=False)
+    mean, std = (torch.tensor(values).reshape(3, 1, 1) for values in (IMAGE_MEAN, IMAGE_STD))
+
+    def run(work: str, images: np.ndarray, mask: np.ndarray | None) -> Outputs:
+        del work, mask
+        with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=dtype == "bfloat16"):
+            made = model((torch.from_numpy(images)[None] - mean) / std)
+        return _outputs(made.extrinsics.numpy()[:, :, :3], made.depth.numpy(), made.depth_conf.numpy())
+
+    return run
+
+
 def _outputs(pose, depth, confidence) -> Outputs:
     names = ("pose_encoding", "depth", "confidence")
     return {
@@ -185,6 +214,8 @@ def main(side: str, weights: str, *rest: str) -> None:
     dtype = "bfloat16" if "bfloat16" in rest else "float32"
     if side == "ours":
         run = ours(Path(weights), dtype)
+    elif (Path(rest[0]) / "depth_anything_3").exists():
+        run = da3_peer(Path(weights), Path(rest[0]), dtype)
     else:
         run = peer(Path(weights), Path(rest[0]), mapped="mapped" in rest[1:], dtype=dtype)
     answers = os.fdopen(os.dup(1), "w")

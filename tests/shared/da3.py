@@ -1,14 +1,19 @@
-"""Numbers that the public code of Depth Anything 3 computed for seeded weights; they lie in tests/golden/da3."""
+"""Depth Anything 3 with seeded weights, and what its public code computed with them (tests/golden/da3).
+
+python -m tests.shared.da3 OUT NAME writes a file as published: NAME is da3-small or da3-base.
+"""
 
 from __future__ import annotations
 
 import functools
 import json
 import re
+import sys
 from typing import Any
 
 import jax
 import numpy as np
+from safetensors.numpy import save_file
 
 from converters import convert_state_dict
 from tests.shared.golden import GOLDEN
@@ -86,3 +91,7 @@ class GoldenPass:
         self.tokens = None
         if "patch_masks" in self.arrays:
             self.tokens = self.arrays["patch_masks"].astype(bool)
+
+
+if __name__ == "__main__":
+    save_file(published(seeded_weights(sys.argv[2])), sys.argv[1], {"format": "pt"})
