@@ -22,7 +22,7 @@ from converters.foreign import refuse_foreign
 from converters.locate import Weights, locate
 from converters.published import published_config, shared_once
 from converters.rules import IGNORED, Rule, Transform, rules
-from converters.trained import own_heads, own_names
+from converters.trained import USUAL, own_heads, own_names
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import CheckpointError, InputError, problems_sentence, reading
 from vggtjax.network.checkpoint import DType, flat_shapes, numpy_dtype, write_checkpoint
@@ -192,7 +192,7 @@ def convert_weights(
 def _own(tensors: Mapping[str, T], config: VGGTConfig, source: str) -> Mapping[str, T]:
     """Return tensors by the network's own names; raises CheckpointError as `own_names`, and for another network's."""
     modules = {rule.source.partition(".")[0] for rule in rules(config)}
-    own = own_names(tensors, modules, source)
+    own = own_names(tensors, modules, source, USUAL[config.family])
     if own is not tensors:
         refuse_foreign(source, own)
     return shared_once(own, source)

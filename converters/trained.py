@@ -21,14 +21,15 @@ SOURCES = {  # the modules of heads, by family
     "vggt": {"camera": "camera_head", "depth": "depth_head", "points": "point_head", "tracks": "track_head"},
     "da3": {"camera": "cam_dec", "depth": "head", "rays": "head"},
 }
-_USUAL = "model."  # prefix of published files
+USUAL = {"vggt": "", "da3": "model."}  # prefix of published files
 
 logger = logging.getLogger(__name__)
 
 
-def own_names(tensors: Mapping[str, T], modules: Collection[str], source: str) -> Mapping[str, T]:
-    """Return tensors by the network's own names, without a prefix that all of them share, such as `module.`; say which.
+def own_names(tensors: Mapping[str, T], modules: Collection[str], source: str, usual: str = "") -> Mapping[str, T]:
+    """Return tensors by the network's own names, without a prefix that all of them share, such as `module.`.
 
+    The prefix is said, unless it is the `usual` one.
     `modules` are the first words of its names. Raises CheckpointError for an adapter that is not merged into its
     weights, and for weights that are there twice, such as beside their moving average.
     """
@@ -47,7 +48,7 @@ def own_names(tensors: Mapping[str, T], modules: Collection[str], source: str) -
     (prefix,) = copies or ("",)
     if not prefix:
         return tensors
-    if prefix != _USUAL:
+    if prefix != usual:
         logger.warning("the keys of %s begin with %s, which is left out", source, prefix)
     own = {name: value for name, value in tensors.items() if name not in _COUNTED}
     return {name.removeprefix(prefix): value for name, value in own.items()}

@@ -219,6 +219,8 @@ class VGGTConfig:
         known = self.row.heads
         if not self.heads or self.heads != tuple(name for name in known if name in self.heads):
             raise InputError(f"heads is {self.heads}; expected at least one of {known}, in this order")
+        if "rays" in self.heads and "depth" not in self.heads:
+            raise InputError(f"heads is {self.heads}; expected depth with rays, which read its maps")
         if self.image_size % self.patch_size:
             raise InputError(f"image_size {self.image_size} is not a multiple of patch_size {self.patch_size}")
         for channels, heads, multiple in (

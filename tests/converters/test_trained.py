@@ -102,7 +102,7 @@ KEYS = {
     "OmniVGGT": "aggregator.camera_adapters.0.weight",
     "Pi3": "point_decoder.blocks.0.norm1.weight",
     "MapAnything": "info_sharing.blocks.0.norm1.weight",
-    "Depth Anything 3": "model.backbone.pretrained.cls_token",
+    "Depth Anything 3 Nested": "model.da3.backbone.pretrained.cls_token",
     "AnySplat": "encoder.aggregator.camera_token",
     "HunyuanWorld-Mirror": "visual_geometry_transformer.camera_token",
 }
@@ -110,7 +110,8 @@ KEYS = {
 
 @pytest.mark.parametrize("name", KEYS)
 def test_known_by_a_key(state_dict, config, name):
-    with pytest.raises(CheckpointError, match=f"is a checkpoint of {name}, not of VGGT: .* expected weights of VGGT$"):
+    expected = f"is a checkpoint of {name}, not of VGGT: .* expected weights of VGGT or Depth Anything 3$"
+    with pytest.raises(CheckpointError, match=expected):
         convert_state_dict(state_dict | {KEYS[name]: np.ones(3, np.float32)}, config)
 
 

@@ -238,7 +238,7 @@ def test_shared_passes_need_what_is_read(model):
     assert again.first is shared.first
     assert np.allclose(again.second.pose_encoding, run(masks=jnp.asarray(MASKS)).second.pose_encoding, atol=1e-5)
     for changed, options, masks, sentence in (
-        (shared._replace(patch_tokens=None), Options(), None, "shared has no patch tokens"),
+        (shared._replace(features=None), Options(), None, "shared has no features"),
         (shared, Options(mask="matches"), None, "shared has no matches between frames"),
         (shared, Options(), soft_masking(model.config), "masks are soft and change the first pass"),
     ):

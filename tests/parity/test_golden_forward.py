@@ -78,8 +78,9 @@ def test_pose_codec(case):
 @pytest.mark.proof
 def test_tokens():
     case = golden_pass("frames4")
-    patch_tokens = jax.jit(partial(encode, config=case.config))(case.params, case.images)
-    assert_close(patch_tokens, case.arrays["plain/patch_tokens"])
+    features = jax.jit(partial(encode, config=case.config))(case.params, case.images)
+    assert features.class_tokens is None
+    assert_close(features.patch_tokens, case.arrays["plain/patch_tokens"])
     layers = (0, 4, 11, 23)  # layer 0 is not a tap of the model, but a tap can be anywhere
     run = partial(
         aggregate,
@@ -87,7 +88,7 @@ def test_tokens():
         grid=case.tokens.shape[2:],
         captures=[identity] * len(layers),
     )
-    camera, tokens, _ = jax.jit(run)(case.params, patch_tokens)
+    camera, tokens, _ = jax.jit(run)(case.params, features)
     for layer, made in zip(layers, tokens, strict=True):
         assert_close(made, case.arrays[f"plain/tokens_{layer}"])
     assert_close(camera, case.arrays["plain/tokens_23"][:, :, 0])
