@@ -7,6 +7,7 @@ from typing import Any
 
 from vggtjax.config import VGGTConfig
 from vggtjax.network.aggregator import Aggregator
+from vggtjax.network.backbone import Features
 from vggtjax.network.kernels.captured import Capture
 from vggtjax.network.layers import Params
 from vggtjax.network.precision import full_precision
@@ -15,12 +16,13 @@ from vggtjax.network.precision import full_precision
 @full_precision()
 def aggregate(
     params: Params,
-    patch_tokens: Any,
+    features: Any,
     config: VGGTConfig,
     grid: tuple[int, int],
     *,
     captures: Sequence[Capture],
     **options: Any,
 ) -> Any:
-    """Return the camera tokens, the captured taps and the sums, as `Aggregator` does."""
-    return Aggregator(config).apply({"params": params["aggregator"]}, patch_tokens, grid, captures, **options)
+    """Return the camera tokens, the captured taps and the sums, as `Aggregator` does; of patch tokens, too."""
+    features = features if isinstance(features, Features) else Features(features)
+    return Aggregator(config).apply({"params": params["aggregator"]}, features, grid, captures, **options)
