@@ -28,6 +28,7 @@ from vggtjax.storage.cores import core_count
 from vggtjax.storage.process_memory import process_bytes
 
 IMAGE_MEAN, IMAGE_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # as the network's, without its imports
+_REFERENCE = {"float32": "chosen", "bfloat16": "first"}  # three digits can choose another frame
 
 Outputs = dict[str, np.ndarray]
 Run = Callable[[str, np.ndarray, np.ndarray | None], Outputs]  # work, images [S, 3, H, W] in [0, 1], mask [S, H, W]
@@ -66,7 +67,7 @@ def ours(weights: Path, dtype: str) -> Run:
         if mask is not None:
             return {"pose_encoding": np.asarray(call(masked, x, jnp.asarray(mask)[None]).pose_encoding[0])}
         if work == "pass":
-            made = call(forward, x, outputs=("camera", "depth"))
+            made = call(forward, x, outputs=("camera", "depth"), reference=_REFERENCE[dtype])
             poses = made.pose_encoding
             if model.config.row.direct_cameras:  # which the public code gives as matrices
                 poses = decode_pose(poses, x.shape[2:4])[0]
@@ -162,12 +163,13 @@ def da3_peer(weights: Path, checkout: Path, dtype: str) -> Run:
     name = next(name for name, config in DA3.items() if config.embed_dim == width)
     model = create_object(load_config(str(checkout / f"depth_anything_3/configs/{name}.yaml"))).eval()
     model.load_state_dict(tensors, strict=False)
+    strategy = {"chosen": "saddle_balanced"}.get(_REFERENCE[dtype], _REFERENCE[dtype])
     mean, std = (torch.tensor(values).reshape(3, 1, 1) for values in (IMAGE_MEAN, IMAGE_STD))
 
     def run(work: str, images: np.ndarray, mask: np.ndarray | None) -> Outputs:
         del work, mask
         with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=dtype == "bfloat16"):
-            made = model((torch.from_numpy(images)[None] - mean) / std)
+            made = model((torch.from_numpy(images)[None] - mean) / std, ref_view_strategy=strategy)
         return _outputs(made.extrinsics.numpy()[:, :, :3], made.depth.numpy(), made.depth_conf.numpy())
 
     return run
@@ -211,6 +213,8 @@ def disk_reads() -> int:
 
 def main(side: str, weights: str, *rest: str) -> None:
     """Load a model, report it, and run passes until standard input ends."""
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # other prints must not mix with answers
     dtype = "bfloat16" if "bfloat16" in rest else "float32"
     if side == "ours":
         run = ours(Path(weights), dtype)
@@ -218,8 +222,6 @@ def main(side: str, weights: str, *rest: str) -> None:
         run = da3_peer(Path(weights), Path(rest[0]), dtype)
     else:
         run = peer(Path(weights), Path(rest[0]), mapped="mapped" in rest[1:], dtype=dtype)
-    answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # other prints must not mix with answers
     answers.write('{"ready": true}\n')
     answers.flush()
     for line in sys.stdin:

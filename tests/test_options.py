@@ -41,13 +41,13 @@ def test_the_passes_depend_on_all_options_but_those_of_the_assembly():
     """A new option is one of them unless it is named there."""
     other = {"gram": "dot", "suppress": "drop", "mask_pairs": 2, "smooth_frames": 3, "compute_dtype": "bfloat16"}
     other |= {"threshold": "multi-otsu", "mask": "matches"}
-    # Absent where it is exact, as are the precision where it is the highest, and masks of the papers.
-    other |= {"attention": "sampled"}
+    # Absent where it is exact, as are the precision where it is the highest, masks of the papers, chosen references.
+    other |= {"attention": "sampled", "reference": "first"}
     fields = {field.name for field in dataclasses.fields(Options)}
     key = Options().passes_settings(MOTION)
     named = fields - {"method", "align_scale", "refine_mask", "refine_cameras", "consistent_depth"} | {"clusters"}
-    assert set(key) == named - {"attention", "precision", "mask"}
-    assert set(Options(attention="sampled").passes_settings(MOTION)) == named - {"precision", "mask"}
+    assert set(key) == named - {"attention", "precision", "mask", "reference"}
+    assert set(Options(attention="sampled").passes_settings(MOTION)) == named - {"precision", "mask", "reference"}
     assert Options("4dvggt-m").passes_settings(MOTION) == Options(mask="matches").passes_settings(MOTION)
     assert Options("4dvggt-m", mask="gram").passes_settings(MOTION) == key
     assert "attention" not in Options().to_json()

@@ -27,7 +27,6 @@ Reference = Literal["chosen", "first", "middle"]
 FamilyName = Literal["vggt", "da3"]
 _MATCHING = (0.5, 0.65)  # relative depths of the pairs that match, where no others are named
 VGGT_HEADS = ("camera", "depth", "points", "tracks")  # of the published weights
-HEAD_NAMES = (*VGGT_HEADS, "rays")  # all heads that the network knows, in the order of `VGGTConfig.heads`
 
 
 @dataclass(frozen=True)

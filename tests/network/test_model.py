@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.shared.da3 import TINY as DA3_TINY
 from tests.shared.seeded import seeded_images
 from tests.shared.tiny import tiny_config
 from vggtjax import VGGTConfig, forward
-from vggtjax.config import HEAD_NAMES, VGGT_HEADS, vggt_1b
+from vggtjax.config import FAMILIES, vggt_1b
 from vggtjax.errors import InputError
 from vggtjax.network.heads.dpt_head import DENSE_HEADS, DenseMap
 from vggtjax.network.kernels.narrow import narrowed
@@ -154,11 +155,12 @@ def test_parameters_without_a_head_of_the_configuration_are_named(params, config
         run(np.zeros((1, 2, 28, 42, 3)), config)
 
 
-def test_every_head_fills_its_fields():
-    config = tiny_config()
-    assert config.heads == HEAD_NAMES == tuple(HEADS)
+@pytest.mark.parametrize("config", [tiny_config(), DA3_TINY], ids=str)
+def test_every_head_fills_its_fields(config):
+    assert config.heads == config.row.heads
+    assert {name for family in FAMILIES.values() for name in family.heads} == set(HEADS)
     images = np.zeros((1, 2, 28, 42, 3), np.float32)
-    for name in HEAD_NAMES:
+    for name in config.heads:
         queries = np.ones((1, 1, 2), np.float32) if name == "tracks" else None
         run = partial(forward, config=config, outputs=(name,))
         made = jax.eval_shape(run, parameter_shapes(config), images, query_points=queries)
@@ -168,7 +170,8 @@ def test_every_head_fills_its_fields():
 def test_a_row_of_the_table_is_a_dense_head(monkeypatch, config):
     """One value a pixel, without an axis; an output that no code makes is an error, not None."""
     sky = DenseMap("sky_head", "depth", values=1, activate=jax.nn.sigmoid)
-    monkeypatch.setattr("vggtjax.config.HEAD_NAMES", (*VGGT_HEADS, "sky"))
+    row_of_vggt = FAMILIES["vggt"]
+    monkeypatch.setitem(FAMILIES, "vggt", dataclasses.replace(row_of_vggt, heads=(*row_of_vggt.heads, "sky")))
     for table, row in ((HEADS, sky.module), (FIELDS, sky.fields), (DENSE_HEADS, sky)):
         monkeypatch.setitem(table, "sky", row)
     config = dataclasses.replace(config, heads=("camera", "sky"))
