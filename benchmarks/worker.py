@@ -70,7 +70,7 @@ def ours(weights: Path, dtype: str) -> Run:
             made = call(forward, x, outputs=("camera", "depth"), reference=_REFERENCE[dtype])
             poses = made.pose_encoding
             if model.config.row.direct_cameras:  # which the public code gives as matrices
-                poses = decode_pose(poses, x.shape[2:4])[0]
+                poses = decode_pose(poses, (x.shape[2], x.shape[3]))[0]
             return _outputs(poses, made.depth, made.depth_confidence)
         assembly, passes = call(infer, x, method=work)
         first = passes.first

@@ -123,6 +123,14 @@ def test_the_network_loads_no_library_of_the_command_line():
     assert subprocess.check_output([sys.executable, "-c", code], text=True) == "set()\n"
 
 
+def test_nothing_above_the_network_asks_for_its_family():
+    allowed = {"config.py", "network", "pipeline/pretrained"}
+    paths = [path for path in (ROOT / "vggtjax").rglob("*.py") if path.parent != ROOT / "vggtjax/network"]
+    asks = re.compile(r"model\.config\.family|config\.family [!=]=|vggtjax\.config import .*\b(FAMILIES|DA3)\b")
+    found = {str(path.relative_to(ROOT / "vggtjax")) for path in paths if asks.search(path.read_text(encoding="utf-8"))}
+    assert {name for name in found if not any(name.startswith(start) for start in allowed)} == set()
+
+
 def test_an_upward_import_and_a_circle_are_found(graph, layer):
     worse = graph | {"vggtjax.network.positions": {"vggtjax.method.mask"}}
     assert upward(worse, layer) == ["vggtjax.network.positions -> vggtjax.method.mask"]

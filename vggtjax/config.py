@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta
 
-from vggtjax.errors import InputError
+from vggtjax.errors import InputError, check_choice
 from vggtjax.storage.json_values import Count, Natural, Share, check_fields, parse_json, without_defaults
 
 LARGEST = 1_000_000  # size of one part of a network
@@ -24,7 +24,6 @@ Precision = Literal["highest", "tf32"]
 Threshold = Literal["otsu", "multi-otsu"]
 Witness = Literal["gram", "matches"]  # of motion
 Reference = Literal["chosen", "first", "middle"]
-FamilyName = Literal["vggt", "da3"]
 _MATCHING = (0.5, 0.65)  # relative depths of the pairs that match, where no others are named
 VGGT_HEADS = ("camera", "depth", "points", "tracks")  # of the published weights
 
@@ -207,12 +206,13 @@ class VGGTConfig:
     track_position_embedding: bool = False
     heads: tuple[str, ...] = VGGT_HEADS  # of the model; a conversion can omit some
     motion: MotionConfig = field(default_factory=MotionConfig)
-    family: FamilyName = "vggt"
+    family: str = "vggt"  # a row of `FAMILIES`
     gated_mlp: Annotated[int, Meta(ge=0, le=LARGEST)] = 0  # hidden channels of the blocks' SwiGLU; 0: GELU with 4 C
     leading_global: bool = False  # whether one global block comes before the pairs
 
     def __post_init__(self) -> None:
         check_fields(self)
+        check_choice("family", self.family, tuple(FAMILIES))
         if unknown := [name for name in self.heads if name not in self.row.heads]:
             raise InputError(f"heads has {unknown}; expected some of {self.row.heads}")
         known = self.row.heads

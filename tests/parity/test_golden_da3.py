@@ -90,7 +90,7 @@ def test_tokens(kind):
     """In the clip's own order; the public code has the reference first."""
     case, arrays = golden_pass("forward_frames5"), golden_pass("forward_frames5").arrays
     B, S = case.images.shape[:2]
-    grid, order = case.tokens.shape[2:], arrays["reference/order"][0]
+    grid, order = np.shape(case.tokens)[2:], arrays["reference/order"][0]
     features = jax.jit(partial(encode, config=case.config))(case.params, case.images)
     assert spread_error(features.patch_tokens[:, order], arrays["plain/tokens_base"][:, :, 1:]) <= 1e-5
 
@@ -137,16 +137,16 @@ def test_known_cameras():
     case, arrays = golden_pass("forward_posed"), golden_pass("forward_posed").arrays
     cameras = encode_pose(arrays["input/extrinsics"][..., :3, :], arrays["input/intrinsics"], case.size)
     assert spread_error(as_read(cameras), arrays["input/pose_enc"]) <= 1e-5
-    clips = ClipBatch(case.images, cameras=cameras)
+    clips = ClipBatch(jnp.asarray(case.images), cameras=cameras)
     assert spread_error(encode_cameras(case.params, clips, case.config), arrays["plain/camera_token"]) <= 1e-5
     assert_equal(case, "plain", cameras=cameras)
     with pytest.raises(InputError, match=r"cameras have shape \(1, 3, 9\); expected \(1, 4, 9\)"):
-        forward(case.params, case.images, case.config, cameras=cameras[:, :3])
+        forward(case.params, clips.images, case.config, cameras=cameras[:, :3])
 
 
 def test_bfloat16():
     """The blocks' products have three digits; reference frame and masks are as in float32."""
     case = golden_pass("forward_frames5")
     made = _forward(case.params, case.images, case.config, compute_dtype="bfloat16", reference="first")
-    assert spread_error(inverted_pose(made.pose_encoding), case.arrays["first/pose_enc"]) <= 0.1
-    assert spread_error(made.depth, case.arrays["first/depth"]) <= 0.2
+    assert spread_error(inverted_pose(made.pose_encoding), case.arrays["first/pose_enc"]) <= 0.02
+    assert spread_error(made.depth, case.arrays["first/depth"]) <= 0.1

@@ -192,9 +192,8 @@ class Aggregator(nn.Module):
             gated_mlp=config.gated_mlp,
             dtype=jnp.dtype(compute.compute_dtype),
         )
-        attend, is_real = _global_attention(compute, S, grid, config.special_tokens), None
-        if real is not None:
-            is_real = jnp.repeat(real, T, axis=1)
+        attend: Any = _global_attention(compute, S, grid, config.special_tokens)
+        is_real = None if real is None else jnp.repeat(real, T, axis=1)
         if config.leading_global:
             lead = partial(attend, suppressed=None, is_real=is_real)
             tokens, _, _ = block(name="leading_block")(tokens.reshape(B, S * T, C), global_rope, lead)

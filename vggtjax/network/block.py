@@ -96,8 +96,8 @@ class Block(nn.Module):
         projections = Projections(self.num_heads, C, self.qk_norm, self.dtype, name="attention")
         norm1, norm2 = (LayerNorm(self.epsilon, dtype=self.dtype, name=name) for name in ("norm1", "norm2"))
         scale1, scale2 = (self.param(name, constant(self.layer_scale), (C,)) for name in ("scale1", "scale2"))
-        hidden = {"gated": True, "hidden": self.gated_mlp} if self.gated_mlp else {"hidden": 4 * C}
-        mlp = MLP(features=C, dtype=self.dtype, name="mlp", **hidden)
+        hidden = self.gated_mlp or 4 * C
+        mlp = MLP(hidden, C, gated=self.gated_mlp > 0, dtype=self.dtype, name="mlp")
 
         def before(rows, count):
             x, place = rows

@@ -42,7 +42,7 @@ def encode_cameras(
     params: Params, clips: ClipBatch, config: VGGTConfig, *, compute_dtype: str = "float32", frames: Frames = Frames()
 ) -> Float[Array, "B S C"]:
     """Return the camera tokens of clips with known cameras; every device computes those of all frames."""
-    given = frames.gather(clips.cameras)
+    given = frames.gather(jnp.asarray(clips.cameras))
     B, S = clips.images.shape[:2]
     real = frames.are_real(clips.frame_count, B, S)
     real = None if real is None else frames.gather(real)

@@ -104,10 +104,8 @@ class DPTFeatures(nn.Module):
     in_place: bool = True  # as of `ResidualUnit`
 
     @nn.compact
-    def __call__(
-        self, taps: list[Float[Array, "F h w C"]], *, only_levels: bool = False
-    ) -> Float[Array, "F 8h 8w O"] | list[Float[Array, "F _ _ G"]]:
-        """Return the map, or its levels alone, from which another head fuses a map of its own."""
+    def __call__(self, taps: list[Float[Array, "F h w C"]], *, only_levels: bool = False) -> Any:
+        """Return the map [F, 8h, 8w, O], or its levels alone, from which another head fuses a map of its own."""
         h, w = taps[0].shape[1:3]
         if self.position_embedding:
             taps = [add_positions(tap, aspect=w / h) for tap in taps]

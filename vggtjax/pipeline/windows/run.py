@@ -32,7 +32,7 @@ from vggtjax.method.assembly import check_fuses
 from vggtjax.method.fusion.family import FusionParams
 from vggtjax.method.fusion.file import check_kept, fusion_digest
 from vggtjax.method.passes import track_from
-from vggtjax.network.backbone import ClipBatch, encode
+from vggtjax.network.backbone import ClipBatch, Features, encode
 from vggtjax.network.checkpoint import Model
 from vggtjax.network.heads.track_head import check_track_size
 from vggtjax.options import Options
@@ -163,7 +163,7 @@ def tools_of(
 
     execute, compute = Execute(), compute_by(options)
 
-    def features(images: Array) -> Array:
+    def features(images: Array) -> Features:
         return execute("image features", encode)(
             model.params, images, config=config, compute_dtype=compute.compute_dtype, remat=compute.remat
         )
