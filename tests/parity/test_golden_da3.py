@@ -90,7 +90,7 @@ def test_tokens(kind):
     """In the clip's own order; the public code has the reference first."""
     case, arrays = golden_pass("forward_frames5"), golden_pass("forward_frames5").arrays
     B, S = case.images.shape[:2]
-    grid, order = np.shape(case.tokens)[2:], arrays["reference/order"][0]
+    grid, order = case.tokens.shape[2:], arrays["reference/order"][0]
     features = jax.jit(partial(encode, config=case.config))(case.params, case.images)
     assert spread_error(features.patch_tokens[:, order], arrays["plain/tokens_base"][:, :, 1:]) <= 1e-5
 

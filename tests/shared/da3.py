@@ -88,7 +88,7 @@ class GoldenPass:
         self.size = (meta["height"], meta["width"])
         images = [seeded_images(meta["frames"], *self.size, meta["seed"] + b) for b in range(meta["batch"])]
         self.images = np.stack(images).transpose(0, 1, 3, 4, 2)
-        self.tokens = None
+        self.tokens: Any = None
         if "patch_masks" in self.arrays:
             self.tokens = self.arrays["patch_masks"].astype(bool)
 
