@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vggtjax.config import VGGTConfig
+from vggtjax.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -263,6 +264,8 @@ def _da3(config: VGGTConfig) -> list[Rule]:
 
 def rules(config: VGGTConfig) -> list[Rule]:
     """Return the table of the configuration's family."""
+    if config.family not in IGNORED:
+        raise InputError(f"the family {config.family!r} has no table of PyTorch names; expected {', '.join(IGNORED)}")
     return _da3(config) if config.family == "da3" else _VGGT
 
 

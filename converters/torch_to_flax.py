@@ -22,7 +22,7 @@ from converters.foreign import refuse_foreign
 from converters.locate import Weights, locate
 from converters.published import published_config, shared_once
 from converters.rules import IGNORED, Rule, Transform, rules
-from converters.trained import USUAL, own_heads, own_names
+from converters.trained import SOURCES, USUAL, own_heads, own_names
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import CheckpointError, InputError, problems_sentence, reading
 from vggtjax.network.checkpoint import DType, flat_shapes, numpy_dtype, write_checkpoint
@@ -249,12 +249,12 @@ def _keys_of_other_heads(config: VGGTConfig) -> set[str]:
 
 def _hint(tensors: Mapping[str, Tensor], config: VGGTConfig) -> str:
     """Return advice if the source is of another width or lacks whole heads, else an empty text."""
-    token = tensors.get("aggregator.camera_token")
+    token = tensors.get("aggregator.camera_token", tensors.get("backbone.pretrained.camera_token"))
     if token is not None and token.shape and token.shape[-1] != config.embed_dim:
         widths = f"embed_dim is {token.shape[-1]} in it and {config.embed_dim} in the configuration"
         return f" ({widths}: give its own by --config FILE.json)"
     modules = {name.split(".")[0] for name in tensors}
-    expected = dict.fromkeys(name.split(".")[0] for name in source_shapes(config))
+    expected = dict.fromkeys(SOURCES[config.family][head] for head in config.heads)
     absent = [name for name in expected if name not in modules]
     if not modules & set(expected) or not absent:
         return ""

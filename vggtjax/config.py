@@ -144,6 +144,7 @@ class Family:
     chooses_reference: bool  # the frame with the first camera token; else the clip's first frame
     takes_cameras: bool  # as camera tokens
     relu_in_place: bool  # skips of the dense heads add relu(x); else x
+    world_is_first: bool  # predicted cameras are in the coordinates of the clip's first one; else in free ones
     direct_cameras: bool  # camera-to-world, from a camera token alone; else camera-from-world, by iterations
 
 
@@ -160,6 +161,7 @@ FAMILIES = {
         chooses_reference=False,
         takes_cameras=False,
         relu_in_place=True,
+        world_is_first=True,
         direct_cameras=False,
     ),
     "da3": Family(
@@ -174,6 +176,7 @@ FAMILIES = {
         chooses_reference=True,
         takes_cameras=True,
         relu_in_place=False,
+        world_is_first=False,
         direct_cameras=True,
     ),
 }
@@ -194,7 +197,7 @@ class VGGTConfig:
     num_heads: Size = 16
     dino_depth: Size = 24
     dino_num_heads: Size = 16
-    camera_depth: Size = 4
+    camera_depth: Annotated[int, Meta(ge=0, le=LARGEST)] = 4  # blocks of the camera head, or of the encoder of cameras
     camera_num_heads: Size = 16
     dpt_features: Size = 256
     dpt_channels: tuple[Size, Size, Size, Size] = (256, 512, 1024, 1024)
@@ -220,6 +223,8 @@ class VGGTConfig:
             raise InputError(f"heads is {self.heads}; expected at least one of {known}, in this order")
         if "rays" in self.heads and "depth" not in self.heads:
             raise InputError(f"heads is {self.heads}; expected depth with rays, which read its maps")
+        if not self.camera_depth and not self.row.takes_cameras:
+            raise InputError(f"camera_depth is 0; expected at least 1 in a model of the family {self.family}")
         if self.image_size % self.patch_size:
             raise InputError(f"image_size {self.image_size} is not a multiple of patch_size {self.patch_size}")
         for channels, heads, multiple in (
@@ -249,6 +254,11 @@ class VGGTConfig:
     def special_tokens(self) -> int:
         """Tokens of each frame before its patches, in the pairs of blocks: a camera token and registers."""
         return 1 + self.row.registers
+
+    @property
+    def reads_cameras(self) -> bool:
+        """Whether known cameras are tokens of the network: the family takes them, and the model has their encoder."""
+        return self.row.takes_cameras and self.camera_depth > 0
 
     @property
     def clip_size(self) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple, Protocol
@@ -243,9 +244,10 @@ class Aggregator(nn.Module):
             special = jnp.concatenate([special, registers], axis=1)  # [2, 1 + R, C]
         is_other = jnp.asarray(frames.numbers(S) > 0)
         if features.class_tokens is not None:
-            is_other = (
-                frames.numbers(S)[None] != reference_frame(features.class_tokens, real, compute)[:, None]
-            )  # [B, S]
+            if compute.attention == "sampled":  # which sees the whole first frame
+                compute = dataclasses.replace(compute, reference="first")
+            reference = reference_frame(features.class_tokens, real, compute)
+            is_other = frames.numbers(S)[None] != reference[:, None]  # [B, S]
         special = special.astype(patches.dtype)[is_other.astype(int)]  # [(B,) S, 1 + R, C]
         if camera_tokens is not None:
             special = camera_tokens[:, :, None].astype(patches.dtype)

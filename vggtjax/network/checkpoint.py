@@ -133,6 +133,7 @@ class Model:
             "heads": [f"{head} (untrained)" if head in self.untrained_heads else head for head in self.heads],
             **({"revision": self.revision} if self.revision else {}),
             **{f"sha256 of {file}": digest for file, digest in self.origin.items()},
+            "family": self.config.family,
             "pairs": self.config.depth,
             **{size: getattr(self.config, size) for size in ("embed_dim", "num_heads", "image_size", "patch_size")},
         }

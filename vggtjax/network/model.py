@@ -244,7 +244,7 @@ def _declared(config: VGGTConfig) -> Params:
         family = {}
         if not config.row.norms_features:
             family["tap_norm"] = declared(LayerNorm(), patches)
-        if config.row.takes_cameras:
+        if config.reads_cameras:
             family["camera_encoder"] = declared(CameraEncoder(config), jnp.zeros((1, 1, POSE_SIZE)))
         return {
             "backbone": declared(Backbone(config), images),
@@ -281,8 +281,8 @@ def _check(params: Params, grid: tuple[int, int], clips: ClipBatch, config: VGGT
     if patch_tokens is not None and tuple(patch_tokens.shape) != tokens_shape:
         raise InputError(f"features have patch tokens of shape {tuple(patch_tokens.shape)}; expected {tokens_shape}")
     if clips.cameras is not None:
-        if not config.row.takes_cameras:
-            raise InputError(f"cameras are given, and a network of the family {config.family!r} reads none")
+        if not config.reads_cameras:
+            raise InputError("cameras are given, and this network reads none")
         if tuple(clips.cameras.shape) != (*tokens_shape[:2], POSE_SIZE):
             raise InputError(f"cameras have shape {clips.cameras.shape}; expected {(*tokens_shape[:2], POSE_SIZE)}")
     if clips.frame_count is not None and tuple(clips.frame_count.shape) != tokens_shape[:1]:

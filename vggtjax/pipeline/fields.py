@@ -8,6 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from vggtjax.cameras import world_from_camera
 from vggtjax.clips.captures.frames import CaptureFrames
 from vggtjax.clips.clip import Clip
 from vggtjax.clips.media.images import ImageFiles
@@ -26,12 +27,17 @@ _MATCHED = "mined: matches between frames and Gram similarities"
 _NOT_MATCHED = "mined: Gram similarities, as matches between frames cannot be used"
 
 
-def assembled_fields(assembly: Assembly, source: Predictions, clip: Clip) -> dict[str, Any]:
+def assembled_fields(
+    assembly: Assembly, source: Predictions, clip: Clip, *, world_is_first: bool = True
+) -> dict[str, Any]:
     """Return a method's depth, confidence and cameras of the first clip; the pass `source` gave the intrinsics.
 
-    Frames of one colour have the lowest confidence of all pixels: nothing in them tells their depth.
+    Frames of one colour have the lowest confidence of all pixels: nothing in them tells their depth. Unless the world
+    already is the first camera's, as far as the network says, it becomes that.
     """
     depth, confidence, camera_from_world, intrinsics = (np.array(x)[0] for x in jax.tree.leaves(assembly))
+    if not world_is_first:
+        camera_from_world = (camera_from_world @ world_from_camera(camera_from_world[:1])).astype(np.float32)
     blank = [number for number, look in enumerate(looks_of(clip.images, clip.valid_box)) if look.is_blank]
     if blank:
         confidence[blank] = np.nanmin(confidence)

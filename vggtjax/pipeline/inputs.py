@@ -70,10 +70,7 @@ def _fitted(
         with on_stage("load clip") as progress:
             return load_clip(clip, model=model, size=size, progress=progress), None
     if tracks is not None:
-        if "tracks" not in model.heads:
-            raise InputError(
-                f"tracks need a model that follows points; this one has the heads {', '.join(model.heads)}"
-            )
+        check_tracks(model)
         tracks.check(*clip.images.shape[:3])
     fitter = Framing(size=size).fitter(model.config)
     if (clip.size, clip.patch) != (fitter.size, fitter.patch):
@@ -81,6 +78,12 @@ def _fitted(
             loaded, clip = clip, clip.refit(fitter.size, fitter.patch)
             tracks = None if tracks is None else tracks.moved(loaded, clip)
     return clip, tracks
+
+
+def check_tracks(model: Model) -> None:
+    """Raise InputError for a model that follows no points."""
+    if "tracks" not in model.heads:
+        raise InputError(f"tracks need a model that follows points; this one has the heads {', '.join(model.heads)}")
 
 
 def _given_geometry(known: KnownGeometry, clip: Clip) -> Given:

@@ -103,6 +103,7 @@ def reconstruct(
     if masks is not None:
         options.check_given_masks()
     options = options.resolved(model.config.motion)
+    check_reference(options, model)
     _check(options, running, tracks, fusion, known)
     clip = clip if isinstance(clip, Clip) else open_source(clip)
     source = clip.source if isinstance(clip, Clip) else clip
@@ -193,6 +194,12 @@ def refined(result: Reconstruction, progress: Progress | None, unit: float = 1.0
     return dataclasses.replace(result, dynamic_mask=mask)
 
 
+def check_reference(options: Options, model: Model) -> None:
+    """Raise InputError for a reference frame that a network does not choose."""
+    if options.reference != "chosen" and not model.config.row.chooses_reference:
+        raise InputError(f"reference is {options.reference!r}; leave it out, as this network takes the first frame")
+
+
 def _check(
     options: Options,
     running: Running,
@@ -224,7 +231,7 @@ def _arguments(
     def padded(x: np.ndarray, **mode: Any) -> Array:
         return shard_frames(np.pad(x, ((0, padding), *((0, 0),) * (x.ndim - 1)), **mode)[None], mesh)
 
-    cameras = read_cameras(inputs) if model.config.row.takes_cameras else None
+    cameras = read_cameras(inputs) if model.config.reads_cameras else None
 
     params, rule = model.params, as_tree(fusion)
     if mesh is not None:
@@ -276,10 +283,16 @@ def _result(
     """Return what the method made of the clip. Raises CheckpointError where parameters are not finite."""
     clip, tracks, (assembly, passes) = inputs.clip, inputs.tracks, outputs
     motion, mask_source = motion_by_matches(passes, inputs.mask_source)
+    cameras_are_read = model.config.reads_cameras and read_cameras(inputs) is not None
     tracked = {} if tracks is None or passes.tracks is None else track_fields(tracks, passes.tracks, len(clip.images))
     try:
         return Reconstruction(
-            **assembled_fields(assembly, getattr(passes, options.row.intrinsics), clip),
+            **assembled_fields(
+                assembly,
+                getattr(passes, options.row.intrinsics),
+                clip,
+                world_is_first=model.config.row.world_is_first or cameras_are_read,
+            ),
             **clip_fields(clip),
             **tracked,
             saliency=np.asarray(passes.saliency[0]),
@@ -287,7 +300,8 @@ def _result(
             dynamic_mask=np.asarray(passes.dynamic_mask[0]),
             method=options.method,
             model_name=model.name,
-            settings=settings_of(model, clip, options, mask_source, fusion),
+            settings=settings_of(model, clip, options, mask_source, fusion)
+            | ({"cameras": "known, read by the network"} if cameras_are_read else {}),
             passes=kept_passes(passes) if running.keep_passes else None,
         )
     except ResultError:

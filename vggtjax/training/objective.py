@@ -110,7 +110,7 @@ def objective(
         return captured
 
     captures = [capture(slot) for slot in range(len(config.taps))]
-    compute = Compute(compute_dtype)
+    compute = Compute(compute_dtype, reference="first")  # the targets are in its camera
 
     def network(model: Params):
         features = encode(model, images, config, compute_dtype=compute_dtype)

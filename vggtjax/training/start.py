@@ -57,7 +57,7 @@ def adapted(model: Model, recipe: Recipe) -> Params:
         )
     backbone, side = model.params["backbone"], config.grid_size
     table = backbone["position_embedding"].astype(jnp.float32)
-    patches = patch_positions(table[1:], model.config.grid_size, (side, side))
+    patches = patch_positions(table[1:], model.config.grid_size, (side, side), by_scale=config.row.places_by_scale)
     params = {**model.params, "backbone": {**backbone, "position_embedding": jnp.concatenate([table[:1], patches])}}
     return deepened(params, recipe) if recipe.start.new_pairs else params
 

@@ -27,7 +27,7 @@ _PROGRESS = gr.Progress()
 _INTRODUCTION = """# vggtjax: a video in, a 4-D scene out
 You get the **cameras**, the **depth** and a mask of **what moves** in every frame, and a **4-D point cloud** to fly
 through: a viewer that opens offline, a film, the layers frame by frame, and a zip of all files."""
-_MODELS = "“demo” is small and knows generated scenes only; real footage needs VGGT-1B."
+_MODELS = "“demo” is small and knows generated scenes only; real footage needs Depth Anything 3 or VGGT-1B."
 _METHODS = "4dvggt-d is the paper's; 4dvggt-m has other masks; vggt is the fastest."
 _FPS = "0 spreads the frames over the whole video; else they are taken from its start."
 _VIEWER = '<iframe src="gradio_api/file={}" title="3-D viewer" sandbox="allow-scripts allow-downloads"></iframe>'

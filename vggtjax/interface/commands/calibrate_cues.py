@@ -80,7 +80,7 @@ def calibrate_cues(
         check_file(out / MODEL, overwrite=True, sources=[Path(model), Path(model) / MODEL])
         with report.stage("load model") as progress:
             loaded = load_model(model, progress=progress)
-        side = loaded.config.image_size if size is None else size
+        side = loaded.config.clip_size if size is None else size
         if side < 1 or side % loaded.config.patch_size:
             raise InputError(f"size is {side}; expected a multiple of the patch size {loaded.config.patch_size}")
         numbers = None if mask_pairs is None else pairs_to_try(mask_pairs, loaded.config.depth)

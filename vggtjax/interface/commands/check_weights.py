@@ -47,7 +47,7 @@ def check_weights(
         tolerance: most that an output may differ from the public code's, in standard deviations of its array; tracks
             may differ by 2e-3 pixels, their visibility and confidence by 2e-4.
         revision: commit of a hub id, 40 hexadecimal letters; by default the newest one of the first use.
-        config: JSON file with the configuration; VGGT-1B by default.
+        config: JSON file with the configuration; that of the published model by default.
         out: folder for the table, as check-weights.md; by default it is printed alone.
         overwrite: replace the file if it exists.
     """
@@ -69,6 +69,11 @@ def check_weights(
                     "PyTorch file that it was made from"
                 )
         network = load(report, name, config, stage="convert")
+        if packages and not network.config.row.world_is_first:
+            raise InputError(
+                "--peer is VGGT's public code, and the model is of another family; leave it out, or compare passes by "
+                "python -m benchmarks speed"
+            )
         with report.stage("read clip"):
             import numpy as np
 

@@ -32,7 +32,7 @@ def convert(
         source: a .safetensors file, a sharded one (its index or folder), a .pt or .pth file, or a hub id.
         destination: the .safetensors file to write.
         revision: commit of a hub id, 40 hexadecimal letters; by default the newest one of the first use.
-        config: JSON file with the configuration; VGGT-1B by default.
+        config: JSON file with the configuration; that of the published model by default.
         heads: heads to convert, such as camera,depth; all of camera,depth,points,tracks by default.
         dtype: of the written weights.
         overwrite: replace the file if it exists.

@@ -55,7 +55,7 @@ COMMANDS = {
     "export": Command(export, _RESULTS, "a result as files of another program"),
     "import": Command(import_result, _RESULTS, "a result of another program as ours"),
     "info": Command(info, _MODELS, "what a model is made of, or a clip is"),
-    "convert": Command(convert, _MODELS, "a PyTorch checkpoint of VGGT as one .safetensors"),
+    "convert": Command(convert, _MODELS, "a PyTorch checkpoint as one .safetensors"),
     "check-weights": Command(check_weights, _MODELS, "a model's numbers, beside those of the public code"),
     "train": Command(train, _MODELS, "train a model on generated scenes, or finetune one"),
     "calibrate-cues": Command(calibrate_cues, _MODELS, "choose a model's motion cues"),

@@ -61,7 +61,8 @@ def as_read(cameras: Float[Array, "B S 9"], real: Bool[Array, "B S"] | None = No
     rotation, centres = quaternion_to_matrix(cameras[..., 3:7]), inverted_pose(cameras)[..., :3]
     relative = jnp.einsum("bij,bskj->bsik", rotation[:, 0], rotation)
     moved = jnp.einsum("bij,bsj->bsi", rotation[:, 0], centres - centres[:, :1])
-    distances = jnp.linalg.norm(moved, axis=-1)
+    squares = jnp.sum(moved * moved, axis=-1)  # 0 in the first frame, where the root has no gradient
+    distances = jnp.where(squares > 0, jnp.sqrt(jnp.where(squares > 0, squares, 1)), 0)
     count = jnp.full(len(cameras), cameras.shape[1]) if real is None else real.sum(axis=1)
     ordered = jnp.sort(distances if real is None else jnp.where(real, distances, jnp.inf), axis=1)
     median = jnp.take_along_axis(ordered, ((count - 1) // 2)[:, None], axis=1)

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from flax.traverse_util import flatten_dict, unflatten_dict
 
+from vggtjax.network.kernels.quantised import BLOCKS
 from vggtjax.network.layers import Params
 
-_BLOCKS = ("backbone.blocks.", "aggregator.frame_blocks.", "aggregator.global_blocks.", "camera_head.trunk.")
 _LAYERS = ("attention.qkv.", "attention.projection.", "mlp.fc1.", "mlp.fc2.")
 
 
@@ -19,7 +19,7 @@ def is_multiplied(name: str) -> bool:
 
     Norms are computed in float32, and so are the heads but for the blocks of the camera head.
     """
-    return name.startswith(_BLOCKS) and any(layer in name for layer in _LAYERS)
+    return name.startswith(BLOCKS) and any(layer in name for layer in _LAYERS)
 
 
 def narrowed(params: Params, compute_dtype: str) -> Params:

@@ -14,7 +14,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int8, UInt16
 
 LARGEST = 127
-_BLOCKS = ("backbone.blocks.", "aggregator.frame_blocks.", "aggregator.global_blocks.", "camera_head.trunk.")
+BLOCKS = (  # whose kernels can be kept in another form
+    "backbone.blocks.",
+    "aggregator.leading_block.",
+    "aggregator.frame_blocks.",
+    "aggregator.global_blocks.",
+    "camera_head.trunk.",
+    "camera_encoder.trunk.",
+)
 
 
 class Halves(NamedTuple):
@@ -34,7 +41,7 @@ class Quantised(NamedTuple):
 
 def is_quantised(name: str) -> bool:
     """Return whether the parameter of this dotted name is stored in 8 bits: kernels of the blocks, 88 % of VGGT-1B."""
-    return name.startswith(_BLOCKS) and name.endswith(".kernel")
+    return name.startswith(BLOCKS) and name.endswith(".kernel")
 
 
 def quantise(kernel: Float[np.ndarray, "*L I O"]) -> Quantised:

@@ -37,6 +37,7 @@ from vggtjax.network.checkpoint import Model
 from vggtjax.network.heads.track_head import check_track_size
 from vggtjax.options import Options
 from vggtjax.pipeline.agreement import agree_with_pixels
+from vggtjax.pipeline.inputs import check_tracks
 from vggtjax.pipeline.run import reconstruct
 from vggtjax.pipeline.running import Running
 from vggtjax.pipeline.steps import Execute
@@ -131,6 +132,8 @@ def reconstruct_long(
     plan = long_run or LongRun(fitter=Framing().fitter(model.config))
     if isinstance(plan.tracks, str):
         check_words(plan.tracks)
+    if plan.tracks is not None:
+        check_tracks(model)
     if options.refine_cameras:
         raise InputError("refine_cameras is for clips that are run at once; leave it out, or take fewer frames")
     options, asked = (each.changed(consistent_depth=False) for each in (options, asked))

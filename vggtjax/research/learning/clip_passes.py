@@ -146,7 +146,7 @@ def generated_passes(
     """
     from vggtjax.training.scenes import SceneConfig, held_out_scenes
 
-    side = model.config.image_size if (size := settings.get("size")) is None else size
+    side = model.config.clip_size if (size := settings.get("size")) is None else size
 
     @cache  # all scenes are drawn at once, and only if passes are missing
     def scenes() -> Any:
@@ -216,7 +216,7 @@ def _all_passes(
     progress: Progress | None = None,
 ) -> Iterator[tuple[str, ClipPasses]]:
     """Yield names and passes of `count` clips; None stands for a clip that is left out."""
-    size = model.config.image_size if size is None else size
+    size = model.config.clip_size if size is None else size
     options = options if isinstance(options, Options) else Options(**(options or {}))
     as_in_the_paper = {"align_scale": False, "refine_mask": False, "refine_cameras": False, "consistent_depth": False}
     options = options.changed(method=METHOD, **as_in_the_paper)

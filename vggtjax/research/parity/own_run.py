@@ -46,7 +46,7 @@ def demo_frames(model: Model, count: int) -> Frames:
 
     Raises InputError unless `count` is from 1 to the number of frames of the clip.
     """
-    truth, size = demo_clip(), model.config.image_size
+    truth, size = demo_clip(), model.config.clip_size
     total = len(truth.images)
     if whole_number("frames", count, 1) > total:
         raise InputError(f"frames is {count}; expected at most the {total} of the embedded clip")
