@@ -1,4 +1,4 @@
-"""The whole method on networks of the second family: padding, known cameras, the world, gradients, both odd parts of Giant."""
+"""The whole method on networks of the second family, Depth Anything 3."""
 
 import dataclasses
 from typing import Any

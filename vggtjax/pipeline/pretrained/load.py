@@ -42,8 +42,8 @@ def load_model(
         name_or_path: "demo" (the small model in the package), a checkpoint of this library, PyTorch weights
             (.safetensors, index or folder of shards, .pt, .pth), or a hub id such as "facebook/VGGT-1B", at the commit
             that was its newest on the first use, unless it ends in "@" and another of 40 hexadecimal letters.
-        config: the configuration of PyTorch weights; None for published ones. A checkpoint of this library contains its own.
-            Weights that lack heads, as VGGT's trainer writes them, give a model without these heads.
+        config: the configuration of PyTorch weights; None for published ones. A checkpoint of this library contains its
+            own. Weights that lack heads, as VGGT's trainer writes them, give a model without these heads.
         dtype: of the parameters; None for the types in the checkpoint, and float32 for PyTorch weights. "int8" rounds
             the kernels of the blocks to 8 bits as they are read: an approximation (docs/research-notes).
         compute_dtype: type in which the blocks will be computed: "bfloat16" reads what they multiply in bfloat16, with
