@@ -23,7 +23,7 @@ from converters.locate import Weights, locate
 from converters.published import published_config, shared_once
 from converters.rules import IGNORED, Rule, Transform, rules
 from converters.trained import SOURCES, USUAL, own_heads, own_names
-from vggtjax.config import VGGTConfig
+from vggtjax.config import FAMILIES, VGGTConfig
 from vggtjax.errors import CheckpointError, InputError, problems_sentence, reading
 from vggtjax.network.checkpoint import DType, flat_shapes, numpy_dtype, write_checkpoint
 from vggtjax.progress import Progress, no_progress
@@ -128,6 +128,9 @@ def convert(
         OutputError: the destination cannot be written.
         MissingExtraError: the source needs torch or huggingface_hub, which is not installed.
     """
+    known = tuple(dict.fromkeys(name for family in FAMILIES.values() for name in family.heads))
+    if unknown := [name for name in heads or () if name not in known]:  # before anything is downloaded
+        raise InputError(f"heads has {unknown}; expected some of {known}")
     return convert_weights(locate(source), destination, dtype=dtype, config=config, heads=heads, progress=progress)
 
 

@@ -23,7 +23,7 @@ from vggtjax.method.algorithm import Clips, run_method
 from vggtjax.method.fusion.family import paper_rule
 from vggtjax.method.fusion.inputs import observe
 from vggtjax.method.passes import Passes
-from vggtjax.network.backbone import ClipBatch
+from vggtjax.network.backbone import ClipBatch, Features
 from vggtjax.network.kernels.attention import attention
 from vggtjax.network.kernels.frames import AXIS, BY_FRAME, REPLICATED, Frames, OnDevices
 from vggtjax.network.kernels.narrow import narrowed
@@ -180,7 +180,7 @@ def _plain(compiler: Compiler, setup: Setup) -> None:
     """Compile a pass without cues: exact, and with sampled keys on one device."""
     P = setup.grid[0] * setup.grid[1]
     tokens = jax.ShapeDtypeStruct((1, _images(setup).shape[1], P, setup.config.embed_dim), jnp.float32)
-    batch = ClipBatch(_images(setup), tokens)  # type: ignore[arg-type]
+    batch = ClipBatch(_images(setup), Features(tokens))  # type: ignore[arg-type]
     for name, how in (("plain pass", "exact"), ("sampled pass", "sampled")):
         if how == "exact" or setup.devices == 1:
             compute = Compute(setup.dtype, setup.precision, attention=how, frames=compiler.frames)

@@ -15,7 +15,7 @@ import numpy as np
 from tests.shared.static_world import GRID, PATCH, StaticWorld
 from vggtjax.method.matching.witnesses import Evidence
 from vggtjax.method.passes import mine
-from vggtjax.network.backbone import ClipBatch
+from vggtjax.network.backbone import ClipBatch, Features
 from vggtjax.network.heads.pose import encode_pose
 from vggtjax.network.kernels.frames import BY_FRAME, Frames
 from vggtjax.network.kernels.gathered_attention import gathered_attention
@@ -35,7 +35,7 @@ real, found = Frames(mesh, COUNT), {}
 
 
 def mined(evidence: Any, first: Any, tokens: Any, images: Any, how: dict[str, Any], frames: Frames = Frames()) -> Any:
-    return mine(evidence, first, ClipBatch(images, tokens), **how, frames=frames)
+    return mine(evidence, first, ClipBatch(images, Features(tokens)), **how, frames=frames)
 
 
 def compare(method: str, how: dict[str, Any], *inputs: Any) -> Any:

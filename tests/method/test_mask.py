@@ -28,7 +28,7 @@ from vggtjax.method.mask import (
 )
 from vggtjax.method.matching.witnesses import Evidence
 from vggtjax.method.passes import mine
-from vggtjax.network.backbone import ClipBatch
+from vggtjax.network.backbone import ClipBatch, Features
 from vggtjax.network.kernels.frames import Frames
 
 _otsu = jax.jit(otsu_threshold)
@@ -226,7 +226,7 @@ def test_frames_that_make_shares_equal_change_no_mask(options):
     how = {"clusters": 0, "threshold": "otsu"} | options
 
     def mask(saliency, tokens, images, frames=Frames()):
-        return mine(Evidence(saliency), None, ClipBatch(images, tokens), **how, frames=frames).dynamic_mask
+        return mine(Evidence(saliency), None, ClipBatch(images, Features(tokens)), **how, frames=frames).dynamic_mask
 
     alone = jax.jit(mask)(saliency[:, :5], tokens[:, :5], images[:, :5])
     frames = Frames(Mesh(np.array(jax.devices()[:1]), ("frames",)), 5)

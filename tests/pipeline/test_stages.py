@@ -180,8 +180,8 @@ def test_one_program_knows_the_clips_of_a_batch_that_are_still(model):
 def test_values_that_are_not_finite_are_told_once(model, monkeypatch):
     """Of 3 frames of 70 x 70 pixels, 98 pixels of one have no depth and 49 of two no confidence."""
 
-    def spoilt(*args):
-        fields = assembled_fields(*args)
+    def spoilt(*args, **how):
+        fields = assembled_fields(*args, **how)
         fields["depth"][1, :7, :14] = np.nan
         fields["depth_confidence"][1:, :7, :7] = np.inf
         return fields

@@ -28,8 +28,6 @@ OUTPUTS = {
     "depth_confidence": Output("depth_conf"),
     "world_points": Output("world_points"),
     "world_points_confidence": Output("world_points_conf"),
-    "rays": Output("ray"),
-    "rays_confidence": Output("ray_conf"),
     "tracks": Output("track", 2e-3),  # pixels
     "track_visibility": Output("vis", 2e-4),
     "track_confidence": Output("conf", 2e-4),

@@ -82,7 +82,8 @@ def run_own(model: Model, frames: Frames, *, masked: bool) -> tuple[Arrays, floa
 
 
 def _arrays(made: Predictions, size: tuple[int, int], prefix: str = "") -> Arrays:
-    arrays = {name: getattr(made, name) for name in OUTPUTS if getattr(made, name) is not None}
+    names = (*OUTPUTS, "rays", "rays_confidence")  # VGGT's public code has none of these two
+    arrays = {name: getattr(made, name) for name in names if getattr(made, name) is not None}
     if made.pose_encoding is not None:
         arrays[CAMERAS] = decode_pose(made.pose_encoding, size)[0]
     return {prefix + name: np.asarray(array[0], np.float32) for name, array in arrays.items()}
