@@ -95,7 +95,8 @@ def test_gradients(model, clip):
     images = jnp.asarray(clip.images)[None, :3]
 
     def loss(params):
-        return forward(params, images, TINY).depth.mean()
+        made: Any = forward(params, images, TINY)
+        return made.depth.mean()
 
     gradient = jax.jit(jax.grad(loss))(model.params)
     assert all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
