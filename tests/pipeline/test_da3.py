@@ -78,7 +78,7 @@ def test_known_cameras_go_into_the_network(model, clip, result, tmp_path):
         poses=str(tmp_path / "poses.txt"), intrinsics=",".join(map(str, K[[0, 1, 0, 1], [0, 1, 2, 2]]))
     )
     inputs = read_inputs(model, clip, size=70, masks=None, tracks=None, known=known, on_stage=Running().stage)
-    cameras: Any = read_cameras(inputs)
+    cameras: Any = read_cameras(model, inputs)
     expected = encode_pose(jnp.asarray(poses), jnp.tile(jnp.asarray(intrinsics[:1]), (FRAMES, 1, 1)), SIZE)
     np.testing.assert_allclose(cameras, expected, atol=1e-4)
     made = reconstruct(model, clip, size=70, known=known)

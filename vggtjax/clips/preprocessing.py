@@ -11,7 +11,7 @@ from jaxtyping import Float32, UInt8
 from PIL import Image
 
 from vggtjax.clips.media.sampling import Frame
-from vggtjax.clips.sharp_resize import resized
+from vggtjax.clips.opencv_resize import resized
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import ClipError, InputError, check_choice, whole_number
 

@@ -103,14 +103,14 @@ def reconstruct(
     if masks is not None:
         options.check_given_masks()
     options = options.resolved(model.config.motion)
-    check_reference(options, model)
-    _check(options, running, tracks, fusion, known)
+    _check(model, options, running, tracks, fusion, known)
     clip = clip if isinstance(clip, Clip) else open_source(clip)
     source = clip.source if isinstance(clip, Clip) else clip
     of_source = {} if running.is_part else source_setting(source)  # as it is before the work
     inputs = read_inputs(model, clip, size=size, masks=masks, tracks=tracks, known=known, on_stage=running.stage)
 
-    run = partial(run_method, **_arguments(model, inputs, options, running, fusion))
+    cameras = read_cameras(model, inputs)
+    run = partial(run_method, **_arguments(model, inputs, cameras, options, running, fusion))
     with device_memory_errors(_LESS_MEMORY, *inputs.clip.images.shape[:3]):
         started = time.perf_counter()
         with running.stage("compile programs") as progress:
@@ -121,7 +121,7 @@ def reconstruct(
         outputs = _on_host(run(step=Execute(running.stage)), len(inputs.clip.images))
         del run  # with its arrays on the devices
 
-    result = _result(model, inputs, options, running, fusion, outputs)
+    result = _result(model, inputs, cameras is not None, options, running, fusion, outputs)
     warn_of_not_finite(result)
     result, unit = _with_geometry(result, inputs, options, running.stage)
     if options.refine_mask and result.has_mask:
@@ -194,21 +194,18 @@ def refined(result: Reconstruction, progress: Progress | None, unit: float = 1.0
     return dataclasses.replace(result, dynamic_mask=mask)
 
 
-def check_reference(options: Options, model: Model) -> None:
-    """Raise InputError for a reference frame that a network does not choose."""
-    if options.reference != "chosen" and not model.config.row.chooses_reference:
-        raise InputError(f"reference is {options.reference!r}; leave it out, as this network takes the first frame")
-
-
 def _check(
+    model: Model,
     options: Options,
     running: Running,
     tracks: Queries | None,
     fusion: FusionRule | None,
     known: KnownGeometry | None,
 ) -> None:
-    """Raise InputError for arguments that are mutually exclusive, or for more devices than there are."""
+    """Raise InputError for arguments that exclude each other or suit no such network, or for too many devices."""
     frames_mesh(running.devices)
+    if options.reference != "chosen" and not model.config.row.chooses_reference:
+        raise InputError(f"reference is {options.reference!r}; leave it out, as this network takes the first frame")
     if running.devices != 1 and tracks is not None:
         raise InputError(
             f"devices is {running.devices} and points are to be tracked, which takes one device; leave one out"
@@ -219,7 +216,12 @@ def _check(
 
 
 def _arguments(
-    model: Model, inputs: Inputs, options: Options, running: Running, fusion: FusionRule | None
+    model: Model,
+    inputs: Inputs,
+    cameras: Float32[np.ndarray, "S 9"] | None,
+    options: Options,
+    running: Running,
+    fusion: FusionRule | None,
 ) -> dict[str, Any]:
     """Return the arguments of `run_method` for a clip, on the devices that compute them."""
     clip, tracks, masks, mesh = inputs.clip, inputs.tracks, inputs.masks, frames_mesh(running.devices)
@@ -230,8 +232,6 @@ def _arguments(
 
     def padded(x: np.ndarray, **mode: Any) -> Array:
         return shard_frames(np.pad(x, ((0, padding), *((0, 0),) * (x.ndim - 1)), **mode)[None], mesh)
-
-    cameras = read_cameras(inputs) if model.config.reads_cameras else None
 
     params, rule = model.params, as_tree(fusion)
     if mesh is not None:
@@ -257,10 +257,10 @@ def _arguments(
     }
 
 
-def read_cameras(inputs: Inputs) -> Float32[np.ndarray, "S 9"] | None:
-    """Return known cameras as the network reads them: None unless the poses and intrinsics of all frames are known."""
+def read_cameras(model: Model, inputs: Inputs) -> Float32[np.ndarray, "S 9"] | None:
+    """Return known cameras as the network reads them: None unless it reads any, and poses and intrinsics are known."""
     given, (height, width) = inputs.geometry, inputs.clip.images.shape[1:3]
-    if given is None or given.poses is None or given.intrinsics is None:
+    if not model.config.reads_cameras or given is None or given.poses is None or given.intrinsics is None:
         return None
     poses = world_from_camera(np.asarray(given.poses)[:, :3])[:, :3]
     return np.asarray(encode_pose(jnp.asarray(poses), jnp.asarray(given.intrinsics), (height, width)), np.float32)
@@ -275,6 +275,7 @@ def _on_host(outputs: tuple[Assembly, Passes], frames: int) -> tuple[Assembly, P
 def _result(
     model: Model,
     inputs: Inputs,
+    cameras_are_read: bool,
     options: Options,
     running: Running,
     fusion: FusionRule | None,
@@ -283,7 +284,6 @@ def _result(
     """Return what the method made of the clip. Raises CheckpointError where parameters are not finite."""
     clip, tracks, (assembly, passes) = inputs.clip, inputs.tracks, outputs
     motion, mask_source = motion_by_matches(passes, inputs.mask_source)
-    cameras_are_read = model.config.reads_cameras and read_cameras(inputs) is not None
     tracked = {} if tracks is None or passes.tracks is None else track_fields(tracks, passes.tracks, len(clip.images))
     try:
         return Reconstruction(
