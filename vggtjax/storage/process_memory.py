@@ -7,22 +7,10 @@ from pathlib import Path
 
 from vggtjax.storage.free_memory import proc_bytes
 
-_PROCESS = Path("/proc/self")
-_RESET_HIGH_WATER = "5"  # of clear_refs
-
 
 def process_bytes(name: str) -> int | None:
     """Return a figure of /proc/self/status, such as VmRSS, VmHWM or RssAnon, in bytes; None if not on Linux."""
-    return proc_bytes(_PROCESS / "status", name)
-
-
-def reset_high_water() -> int | None:
-    """Set VmHWM to the present memory of the process and return it; None where this is impossible."""
-    try:
-        (_PROCESS / "clear_refs").write_text(_RESET_HIGH_WATER)
-    except OSError:
-        return None
-    return process_bytes("VmRSS")
+    return proc_bytes(Path("/proc/self/status"), name)
 
 
 def peak_bytes() -> int | None:
