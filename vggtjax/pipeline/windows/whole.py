@@ -123,8 +123,7 @@ class Whole:
                         )  # fmt: skip
                     self.joins.append(join)
                 last = here
-                if progress is not None:
-                    progress(number + 1, len(self.windows))
+                (progress or no_progress)(number + 1, len(self.windows))
         usual = self._usual()
         for number, join in enumerate(self.joins):
             edges.append(_edge(number, number + 1, join.similarity, join.residual, usual))
@@ -143,8 +142,7 @@ class Whole:
             for number, loop in enumerate(found):
                 edge = self._verified(loop, like)
                 edges += [] if edge is None else [edge]
-                if progress is not None:
-                    progress(number + 1, len(found))
+                (progress or no_progress)(number + 1, len(found))
         return edges
 
     def _verified(self, loop: Loop, like: Clip) -> Edge | None:
@@ -208,8 +206,7 @@ class Whole:
                     if name in arrays:
                         arrays[name][frame] = getattr(source, name)[number]
                 names.append(source.frame_names[number])
-                if progress is not None:
-                    progress(frame + 1, total)
+                (progress or no_progress)(frame + 1, total)
         if not is_matched:
             arrays.pop("motion", None)
         fields: dict[str, Any] = {"saliency": None, "timestamps": None, **arrays, **tracks}
