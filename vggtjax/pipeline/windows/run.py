@@ -45,7 +45,7 @@ from vggtjax.pipeline.windows.frames import SeenFrames, count_frames, window_cli
 from vggtjax.pipeline.windows.join import JoinRule
 from vggtjax.pipeline.windows.plan import Windows, plan_windows
 from vggtjax.pipeline.windows.store import FOLDER, WindowStore, write_cut
-from vggtjax.pipeline.windows.tracks import Follow, Images, Start, Tracked
+from vggtjax.pipeline.windows.tracks import Follow, Images, Tracked, TrackStart
 from vggtjax.pipeline.windows.whole import Whole, store_window
 from vggtjax.progress import OnStage, Progress, StageSeconds, no_progress, no_stage
 from vggtjax.results.disk import announce, forecast_bytes
@@ -174,7 +174,7 @@ def tools_of(
     def describe(images: Float32[np.ndarray, "F H W 3"]) -> Float32[np.ndarray, "F C"]:
         return np.asarray(features(jax.device_put(images[None])).patch_tokens[0], np.float32).mean(axis=1)
 
-    def follow(images: Images, starts: Sequence[Start]) -> list[Tracked]:
+    def follow(images: Images, starts: Sequence[TrackStart]) -> list[Tracked]:
         frames = jax.device_put(images[None])
         clips, found = ClipBatch(frames, features(frames)), []
         for frame, places in starts:

@@ -18,7 +18,7 @@ from jaxtyping import Float32
 from vggtjax.cameras import Similarity
 from vggtjax.clips.clip import Clip
 from vggtjax.clips.queries import Queries
-from vggtjax.pipeline.windows.blend import View, blend_frame
+from vggtjax.pipeline.windows.blend import WindowView, blend_frame
 from vggtjax.pipeline.windows.frames import clip_of
 from vggtjax.pipeline.windows.graph import Edge, solve_graph
 from vggtjax.pipeline.windows.join import Join, JoinRule, join_windows, reach_of
@@ -194,7 +194,7 @@ class Whole:
                 weights = blend_weights(frame, self.windows)
                 held = {n: held[n] if n in held else self.store.load(window_name(n)) for n in weights}
                 masked_by |= {n: str(window.settings.get("masks")) for n, window in held.items()}
-                views = [View(held[n], frame - self.windows[n].start, worlds[n], w) for n, w in weights.items()]
+                views = [WindowView(held[n], frame - self.windows[n].start, worlds[n], w) for n, w in weights.items()]
                 blended = blend_frame(views)
                 for name in _BLENDED:
                     if name in arrays:
