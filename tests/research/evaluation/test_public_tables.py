@@ -103,7 +103,9 @@ def test_a_perfect_result_follows_points_perfectly():
     tracks = sequence.tracks
     cameras = world_from_camera(room.world_from_camera[:, :3])[:, :3]
     camera = np.einsum("sij,snj->sni", cameras[:, :, :3], tracks.points) + cameras[:, None, :, 3]
-    places = camera[..., :2] / camera[..., 2:] * room.intrinsics[:, None, [0, 1], [0, 1]] + room.intrinsics[:, None, :2, 2]
+    places = (
+        camera[..., :2] / camera[..., 2:] * room.intrinsics[:, None, [0, 1], [0, 1]] + room.intrinsics[:, None, :2, 2]
+    )
     first = np.flatnonzero(tracks.visible[0])
     followed = dataclasses.replace(
         room,

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -20,6 +19,7 @@ from vggtjax.cameras import checked_poses
 from vggtjax.clips.captures.cameras import checked_intrinsics, world_from_camera_of
 from vggtjax.clips.captures.files import files
 from vggtjax.clips.captures.pictures import picture_size
+from vggtjax.clips.captures.unpacked import Unpacked
 from vggtjax.errors import InputError, ResultError
 from vggtjax.research.evaluation.datasets.folders import subfolders
 from vggtjax.research.evaluation.datasets.sequence import FrameChoice, LabelledSequence, Opener
@@ -68,8 +68,8 @@ def _read(path: Path, name: str, frames: FrameChoice) -> LabelledSequence:
     arrays = _arrays(path)
     chosen = frames.of([f"{frame:05d}" for frame in range(len(arrays["visibility"]))], name)
     taken = [int(frame) for frame in chosen]
-    archive = TemporaryDirectory(prefix="vggtjax-frames-", ignore_cleanup_errors=True)
-    pictures = tuple(Path(archive.name) / f"{frame}.jpg" for frame in chosen)
+    archive = Unpacked()
+    pictures = tuple(archive.folder / f"{frame}.jpg" for frame in chosen)
     for picture, frame in zip(pictures, taken, strict=True):
         picture.write_bytes(bytes(arrays["images_jpeg_bytes"][frame]))
     width, height = picture_size(pictures[0])
