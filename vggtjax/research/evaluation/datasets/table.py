@@ -133,7 +133,7 @@ def find_sequences(
     chosen, notices = _chosen(name, root, list(openers), sequences)
     if frames_list is None and frames_seed is not None:
         pinned = {sequence: Pinned(seed=frames_seed) for sequence in chosen}
-    if pinned and sampling != Sampling():
+    if pinned and dataclasses.asdict(sampling) != dataclasses.asdict(Sampling()):
         raise InputError("a list or a seed of frames excludes start, stride, max_frames and skip; give one of them")
     for notice in notices:
         logger.warning("%s", notice)
