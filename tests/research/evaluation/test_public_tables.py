@@ -12,6 +12,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from tests.shared.dataset_files import opened
 from tests.shared.golden import GOLDEN
 from tests.shared.scored_room import room_and_truth
 from vggtjax.cameras import world_from_camera
@@ -22,6 +23,8 @@ from vggtjax.research.evaluation.metrics.camera_pairs import THRESHOLDS
 from vggtjax.research.evaluation.metrics.masks import pooled_scores
 from vggtjax.research.evaluation.protocol import score
 from vggtjax.research.evaluation.truth_at_pixels import TruthAtPixels
+from vggtjax.training.scenes.config import SceneConfig
+from vggtjax.training.scenes.dataset import write_scenes
 
 
 def public(name):
@@ -128,3 +131,15 @@ def test_a_perfect_result_follows_points_perfectly():
     moved = dataclasses.replace(followed, track_positions=followed.track_positions + np.float32(12))
     worse = score(moved, TruthAtPixels(sequence, room)).metrics
     assert worse.get("tracks_world_epe", 1) > 0.05
+
+
+def test_tracks_of_a_generated_scene_move_by_its_flow(tmp_path):
+    write_scenes(tmp_path, SceneConfig(height=48, width=64, frames=4), count=1, seed=5)
+    (sequence,) = opened("plain", tmp_path)
+    tracks, parts = sequence.tracks, sorted((tmp_path / "scene_0000/parts").iterdir())
+    assert tracks.visible[0].all()
+    assert 0.3 < tracks.visible[1:].mean() < 1
+    flow = np.load(sorted((tmp_path / "scene_0000/flow").iterdir())[0])[4::8, 4::8].reshape(-1, 3)
+    np.testing.assert_allclose(tracks.points[1] - tracks.points[0], flow, atol=1e-4)
+    assert np.abs(flow).max() > 0.01
+    assert len(parts) == len(tracks.points) == 4

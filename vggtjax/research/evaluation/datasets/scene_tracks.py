@@ -52,9 +52,10 @@ def scene_tracks(
         raise InputError(
             f"{parts[names[0]]} shows part {own.max()}; expected less than {moved.shape[1]}, as part_poses.npy"
         )
-    start = moved[rows[0], own]
+    later = moved[rows][:, own]  # [S, N, 3, 4]
+    start = later[0]
     within = np.einsum("nji,nj->ni", start[:, :, :3], seen - start[:, :, 3])  # in the part
-    points = np.einsum("snij,nj->sni", moved[rows][:, own, :, :3], within) + moved[rows][:, own, :, 3]
+    points = np.einsum("snij,nj->sni", later[..., :3], within) + later[..., 3]
     visible = np.zeros(points.shape[:2], bool)
     for frame, name in enumerate(names):
         labels, surface = _labels(parts[name]), read_npy(depths[name])
