@@ -57,12 +57,12 @@ def _definition(path: Path, count: int) -> tuple[list[int], dict[int, Path]]:
     """Return the values of the regions but the background's, and the files of labels by the numbers of frames."""
     text = read_text(path)
     try:
-        regions, rest = re.findall(r"Total number of regions:\s+(\d+)\s+(.*)", text, flags=re.DOTALL)[0]
-        values = [int(value) for value in re.findall(r"\s*(\d+)\s", f" {rest}"[: 32 * int(regions)])[: int(regions)]]
+        regions, *rest = text.partition("Total number of regions:")[2].split()
+        values = [int(word) for word in rest[: int(regions)]]
         listed = re.findall(r"Frame number:\s+(\d+)\s+File name:\s+(\S+)", text)
-    except (IndexError, ValueError):
+    except ValueError:
         values, listed = [], []
-    if len(values) < 2 or len(values) != int(regions) or not listed:
+    if len(values) < 2 or not listed:
         raise InputError(f"{path} names no regions or no frames; expected a ground truth definition file of FBMS-59")
     if beyond := [frame for frame, _ in listed if int(frame) >= count]:
         raise InputError(f"{path} has labels of frame {beyond[0]}; the sequence has {count} frames: get it whole")
