@@ -32,10 +32,10 @@ def track_metrics(result: Result, truth: TruthAtPixels, *, dense: bool) -> dict[
     if true is None or truth.sequence.world_from_camera is None or not truth.posed.all():
         raise AbsentError("the sequence has no tracks, or a frame without a camera")
     cameras = world_from_camera(truth.sequence.world_from_camera[:, :3])[:, :3]
-    seen = [project(*frame) for frame in zip(true.points, cameras, truth.intrinsics, strict=True)]
-    places = np.stack([np.stack(axes[:2], axis=-1) for axes in seen])
     low, high = result.valid_box[:, None, :2], result.valid_box[:, None, 2:]
-    with np.errstate(invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):  # of points that are not visible
+        seen = [project(*frame) for frame in zip(true.points, cameras, truth.intrinsics, strict=True)]
+        places = np.stack([np.stack(axes[:2], axis=-1) for axes in seen])
         visible = true.visible & ((places >= low) & (places < high)).all(axis=2)
     points, found, found_visible = true.points, places, visible
     if not dense:
@@ -64,19 +64,17 @@ def track_metrics(result: Result, truth: TruthAtPixels, *, dense: bool) -> dict[
 
 
 def _matched(result: Result, places: np.ndarray, visible: np.ndarray) -> tuple[list[int], list[int]]:
-    """Return which of the result's tracks start at a visible true point, and at which."""
-    own: list[int] = []
-    theirs: list[int] = []
-    for track, frame in enumerate(result.track_frames):
-        shown = np.flatnonzero(visible[frame])
+    """Return which of the result's tracks start at a visible true point, and at which, each once."""
+    own: dict[int, int] = {}
+    for frame in np.unique(result.track_frames):
+        shown, started = np.flatnonzero(visible[frame]), np.flatnonzero(result.track_frames == frame)
         if shown.size:
-            distance, nearest = cKDTree(places[frame, shown]).query(result.track_positions[frame, track])
-            if distance <= _SAME_POINT and shown[nearest] not in theirs:
-                own.append(track)
-                theirs.append(int(shown[nearest]))
+            distances, nearest = cKDTree(places[frame, shown]).query(result.track_positions[frame, started])
+            close = distances <= _SAME_POINT
+            own |= dict(zip(shown[nearest[close]].tolist(), started[close].tolist(), strict=True))
     if not own:
         raise AbsentError("none of the result's tracks starts within a pixel of a true one; follow these")
-    return own, theirs
+    return [*own.values()], [*own]
 
 
 def _lifted(result: Result, places: Float64[np.ndarray, "S N 2"]) -> Float64[np.ndarray, "S N 3"]:

@@ -23,9 +23,8 @@ class TrueTracks:
             raise InputError(f"none of {self.visible.shape[1]} tracks is visible in any of {len(self.visible)} frames")
 
     def of_frames(self, chosen: Sequence[int]) -> TrueTracks:
-        """Return the tracks that are visible in some of these frames, in their order."""
-        seen = self.visible[list(chosen)].any(axis=0)
-        return TrueTracks(*(values[list(chosen)][:, seen] for values in (self.points, self.visible)))
+        """Return the tracks in some frames, in their order."""
+        return TrueTracks(self.points[list(chosen)], self.visible[list(chosen)])
 
 
 def seen_inside(
