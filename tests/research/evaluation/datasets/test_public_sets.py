@@ -106,11 +106,11 @@ def test_segtrack_joins_the_objects(tmp_path):
         opened("segtrack", tmp_path, sequences=["drift"])
 
 
-def video_with_tracks(path, frames=5, shift=0.0, **changes):
+def video_with_tracks(path, frames=5, shift=0.0, spare=0, **changes):
     """https://github.com/google-deepmind/tapnet/tree/main/tapnet/tapvid3d#data-format, as data/construct_po_bench.py of
     St4RTrack writes it: points stand still in the world while the camera moves to the right."""
     jpeg = io.BytesIO()
-    Image.new("RGB", (64, 48)).save(jpeg, "JPEG")
+    Image.new("RGB", (64, 48)).save(jpeg, "JPEG", exif=bytes(spare))
     world = np.array([[0.1, 0, 2], [-0.3, 0.2, 3], [0.5, -0.4, 4]])
     camera = np.tile(np.eye(4), (frames, 1, 1))
     camera[:, 0, 3] = -0.05 * np.arange(frames)
@@ -124,15 +124,17 @@ def video_with_tracks(path, frames=5, shift=0.0, **changes):
         "queries_xyt": np.zeros((3, 3)),
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(path, **{name: value for name, value in (arrays | changes).items() if value is not None})
+    (np.savez if spare else np.savez_compressed)(
+        path, **{name: value for name, value in (arrays | changes).items() if value is not None}
+    )
     return world
 
 
 def test_a_video_with_tracks(tmp_path):
     world = video_with_tracks(tmp_path / "po_mini/cab_0.npz", frames=70)
-    video_with_tracks(tmp_path / "pstudio_mini/ball_3.npz", extrinsics_w2c=None)
+    video_with_tracks(tmp_path / "pstudio_mini/ball_3.npz", 40, spare=30_000, extrinsics_w2c=None)  # more than a MB
     moving, still = opened("worldtrack", tmp_path)
-    assert (moving.name, len(moving), len(still)) == ("po_mini/cab_0", 64, 5)  # the first 64 frames
+    assert (moving.name, len(moving), len(still)) == ("po_mini/cab_0", 64, 40)  # the first 64 frames
     np.testing.assert_allclose(moving.tracks.points, np.tile(world, (64, 1, 1)), atol=1e-6)
     np.testing.assert_allclose(moving.world_from_camera[3][:3, 3], [0.15, 0, 0])
     assert np.array_equal(still.world_from_camera[4], np.eye(4))
