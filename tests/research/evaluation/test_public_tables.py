@@ -8,6 +8,7 @@ masks_easi3r.npz: davis2017/evaluation.py of Easi3R (Inception3D/Easi3R 146a77d7
 """
 
 import dataclasses
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from vggtjax.research.evaluation import pair_angles, pair_scores, recall_area, t
 from vggtjax.research.evaluation.datasets.true_tracks import TrueTracks
 from vggtjax.research.evaluation.metrics.camera_pairs import THRESHOLDS
 from vggtjax.research.evaluation.metrics.masks import pooled_scores
+from vggtjax.research.evaluation.metrics.tracks import TrackAlign
 from vggtjax.research.evaluation.protocol import score
 from vggtjax.research.evaluation.truth_at_pixels import TruthAtPixels
 from vggtjax.training.scenes.config import SceneConfig
@@ -61,17 +63,17 @@ def test_areas_and_angles_by_hand():
 def test_tracks_are_scored_as_by_public_code():
     golden = public("tracks")
     focal = float(np.sqrt(golden["intrinsics"][0] * golden["intrinsics"][1]))
-    found = [golden[name] for name in ("found", "true", "found_visible", "visible")]
-    scores = tapvid3d_scores(*found, focal)
+    found, true, found_visible, visible = (golden[name] for name in ("found", "true", "found_visible", "visible"))
+    scores = tapvid3d_scores(found, true, found_visible, visible, focal)
     for name, value in scores._asdict().items():
         assert value == pytest.approx(golden[f"tapvid3d_{name}"].item(), abs=1e-6)
-    every = np.ones(golden["visible"].shape, bool)
-    for align in ("median", "sim3"):
-        errors = world_track_errors(golden["world_found"], golden["true"], every, align)
+    every = np.ones(visible.shape, bool)
+    for align in get_args(TrackAlign):
+        errors = world_track_errors(golden["world_found"], true, every, align)
         assert errors.apd == pytest.approx(golden[f"worldtrack_{align}_apd"].item(), abs=1e-6)
         assert errors.epe == pytest.approx(golden[f"worldtrack_{align}_epe"].item(), abs=1e-6)
     with pytest.raises(InputError, match="no point is visible in both"):
-        tapvid3d_scores(*found[:2], ~found[3], found[3], focal)
+        tapvid3d_scores(found, true, ~visible, visible, focal)
 
 
 def test_masks_of_easi3r_count_each_frame_once():
@@ -98,12 +100,11 @@ def tracked_room(step=6):
         inside = (x >= 0) & (y >= 0) & (x < room.depth.shape[2]) & (y < room.depth.shape[1])
         seen[frame, inside] = ~room.dynamic_mask[frame, y[inside].astype(int), x[inside].astype(int)]
     tracks = TrueTracks(np.tile(points, (S, 1, 1)), seen)
-    return room, dataclasses.replace(sequence, tracks=tracks)
+    return room, dataclasses.replace(sequence, tracks=tracks), tracks
 
 
 def test_a_perfect_result_follows_points_perfectly():
-    room, sequence = tracked_room()
-    tracks = sequence.tracks
+    room, sequence, tracks = tracked_room()
     cameras = world_from_camera(room.world_from_camera[:, :3])[:, :3]
     camera = np.einsum("sij,snj->sni", cameras[:, :, :3], tracks.points) + cameras[:, None, :, 3]
     places = (
@@ -128,7 +129,7 @@ def test_a_perfect_result_follows_points_perfectly():
 
     scores = score(room, TruthAtPixels(sequence, room))
     assert [note for note in scores.notes if note.startswith("tracks: the result has no tracks; follow")]
-    moved = dataclasses.replace(followed, track_positions=followed.track_positions + np.float32(12))
+    moved = dataclasses.replace(followed, track_positions=places[:, first].astype(np.float32) + 12)
     worse = score(moved, TruthAtPixels(sequence, room)).metrics
     assert worse.get("tracks_world_epe", 1) > 0.05
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import numpy as np
 from jaxtyping import Float64
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from vggtjax.cameras import project, world_from_camera
-from vggtjax.research.evaluation.metrics.tracks import tapvid3d_scores, world_track_errors
+from vggtjax.research.evaluation.metrics.tracks import TrackAlign, tapvid3d_scores, world_track_errors
 from vggtjax.research.evaluation.truth_at_pixels import AbsentError, TruthAtPixels
 from vggtjax.results.result import Result
 from vggtjax.results.tracks import SEEN
@@ -28,10 +30,10 @@ def track_metrics(result: Result, truth: TruthAtPixels, *, dense: bool) -> dict[
         dense: take the true places, and the depth there; else the places of the result's tracks that start at true
             ones, within a pixel.
     """
-    true = truth.sequence.tracks
-    if true is None or truth.sequence.world_from_camera is None or not truth.posed.all():
-        raise AbsentError("the sequence has no tracks, or a frame without a camera")
-    cameras = world_from_camera(truth.sequence.world_from_camera[:, :3])[:, :3]
+    sequence, true = truth.sequence, truth.sequence.tracks
+    if true is None or sequence.world_from_camera is None or sequence.intrinsics is None or not truth.posed.all():
+        raise AbsentError("the sequence has no tracks, no intrinsics, or a frame without a camera")
+    cameras = world_from_camera(sequence.world_from_camera[:, :3])[:, :3]
     low, high = result.valid_box[:, None, :2], result.valid_box[:, None, 2:]
     with np.errstate(divide="ignore", invalid="ignore"):  # of points that are not visible
         seen = [project(*frame) for frame in zip(true.points, cameras, truth.intrinsics, strict=True)]
@@ -39,11 +41,12 @@ def track_metrics(result: Result, truth: TruthAtPixels, *, dense: bool) -> dict[
         visible = true.visible & ((places >= low) & (places < high)).all(axis=2)
     points, found, found_visible = true.points, places, visible
     if not dense:
-        if result.track_positions is None or result.track_visibility is None or result.track_frames is None:
+        positions, starts = result.track_positions, result.track_frames
+        if positions is None or result.track_visibility is None or starts is None:
             raise AbsentError("the result has no tracks; follow the true ones by reconstruct --tracks FILE")
-        own, theirs = _matched(result, places, visible)
+        own, theirs = _matched(positions, starts, places, visible)
         points, visible = points[:, theirs], visible[:, theirs]
-        found = result.track_positions[:, own].astype(np.float64)
+        found = positions[:, own].astype(np.float64)
         found_visible = result.track_visibility[:, own] >= SEEN
     lifted = _lifted(result, found)
     known = np.isfinite(lifted).all(axis=2)
@@ -53,23 +56,25 @@ def track_metrics(result: Result, truth: TruthAtPixels, *, dense: bool) -> dict[
     poses = result.world_from_camera.astype(np.float64)[:, :3]
     worlds = _moved(world_from_camera(poses[:1])[:, :3], _moved(poses, lifted)), _moved(to_first, points)
     height, width = result.source_size[0]
-    focal = np.sqrt(np.prod(truth.sequence.intrinsics[0][[0, 1], [0, 1]])) * _SIDE / min(height, width)
+    focal = np.sqrt(np.prod(sequence.intrinsics[0][[0, 1], [0, 1]])) * _SIDE / min(height, width)
     scores = tapvid3d_scores(lifted, in_camera, found_visible, visible, float(focal))
     kind = "dense" if dense else "tracks"
     metrics = {f"{kind}_apd": scores.apd} | ({} if dense else {"tracks_aj": scores.aj, "tracks_oa": scores.oa})
-    for align, name in (("median", "world"), ("sim3", "sim3")):
-        errors = world_track_errors(*worlds, visible, align)
+    scaled, moved = (world_track_errors(*worlds, visible, align) for align in get_args(TrackAlign))
+    for name, errors in (("world", scaled), ("sim3", moved)):
         metrics |= {f"{kind}_{name}_{key}": value for key, value in errors._asdict().items()}
     return metrics
 
 
-def _matched(result: Result, places: np.ndarray, visible: np.ndarray) -> tuple[list[int], list[int]]:
-    """Return which of the result's tracks start at a visible true point, and at which, each once."""
+def _matched(
+    positions: np.ndarray, starts: np.ndarray, places: np.ndarray, visible: np.ndarray
+) -> tuple[list[int], list[int]]:
+    """Return which tracks start at a visible true point, and at which, each once."""
     own: dict[int, int] = {}
-    for frame in np.unique(result.track_frames):
-        shown, started = np.flatnonzero(visible[frame]), np.flatnonzero(result.track_frames == frame)
+    for frame in np.unique(starts):
+        shown, started = np.flatnonzero(visible[frame]), np.flatnonzero(starts == frame)
         if shown.size:
-            distances, nearest = cKDTree(places[frame, shown]).query(result.track_positions[frame, started])
+            distances, nearest = KDTree(places[frame, shown]).query(positions[frame, started])
             close = distances <= _SAME_POINT
             own |= dict(zip(shown[nearest[close]].tolist(), started[close].tolist(), strict=True))
     if not own:

@@ -2,6 +2,7 @@
 
 import io
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -106,7 +107,7 @@ def test_segtrack_joins_the_objects(tmp_path):
         opened("segtrack", tmp_path, sequences=["drift"])
 
 
-def video_with_tracks(path, frames=5, shift=0.0, spare=0, **changes):
+def video_with_tracks(path, frames=5, shift=0.0, spare=0, **changes: Any):
     """https://github.com/google-deepmind/tapnet/tree/main/tapnet/tapvid3d#data-format, as data/construct_po_bench.py of
     St4RTrack writes it: points stand still in the world while the camera moves to the right."""
     jpeg = io.BytesIO()
@@ -147,7 +148,7 @@ def test_a_video_with_tracks(tmp_path):
 
 def test_bad_files_of_tracks(tmp_path):
     path = tmp_path / "a.npz"
-    for changes, sentence in (
+    cases: tuple[tuple[dict[str, Any], str], ...] = (
         (
             {"shift": 5.0},
             r"track 0 visible at \(185.0, 24.0\) in frame 0, and all its tracks outside the pictures of 64",
@@ -156,7 +157,8 @@ def test_bad_files_of_tracks(tmp_path):
         ({"tracks_XYZ": np.zeros((5, 2, 3))}, r"tracks_XYZ of shape \(5, 2, 3\); expected \(5, 3, 3\)"),
         ({"visibility": None}, "expected images_jpeg_bytes, tracks_XYZ, visibility, fx_fy_cx_cy"),
         ({"visibility": np.zeros((5, 3), bool)}, "none of 3 tracks is visible"),
-    ):
+    )
+    for changes, sentence in cases:
         video_with_tracks(path, **changes)
         with pytest.raises(InputError, match=sentence):
             opened("tapvid3d", tmp_path)
@@ -205,14 +207,15 @@ def test_lists_of_frames(tmp_path):
     assert [len(each) for each in opened("plain", tmp_path / "data", frames_seed=0)] == [10, 10]
     assert read_frames_list(drawn, 3)["run"] == Pinned((), 3, str(drawn))
 
-    for content, options, sentence in (
+    cases: tuple[tuple[str, dict[str, Any], str], ...] = (
         ('{"walk": [3, 12]}', {}, "names frame 12 of sequence walk, which has 12 frames, 00 to 11; get the sequence"),
         ('{"jump": [1]}', {}, "sequence 'jump' of plain is not in"),
         ('{"walk": [1]}', {"sequences": ["run"]}, "has no frames of sequence run; add a line"),
         ('{"walk": [1, 1]}', {}, "for sequence walk; expected a list of numbers or names of frames, each once"),
         ("", {}, "lists no sequence; expected a JSON object"),
         ('{"walk": [1]}', {"sampling": Sampling(stride=2)}, "excludes start, stride, max_frames and skip"),
-    ):
+    )
+    for content, options, sentence in cases:
         write(pinned, content)
         with pytest.raises(InputError, match=sentence):
             find_sequences("plain", tmp_path / "data", frames_list=pinned, **options)

@@ -130,14 +130,14 @@ def _read(folder: Path, name: str, frames: FrameChoice) -> LabelledSequence:
                 metres = np.where(_UNKNOWN[what](values), 0, metres) if values.shape == metres.shape else metres
         return np.where(metres > farthest, 0, metres).astype(np.float32)
 
-    there = {"depth": bool(depths), "poses": poses is not None}
+    there: dict[str, Any] = {"depth": Maps(pictures, depths, depth, is_depth=True) if depths else None, "poses": poses}
     return LabelledSequence(
         name,
         tuple(pictures),
-        Maps(pictures, depths, depth, is_depth=True) if depths else None,
+        there["depth"],
         world_from_camera=poses,
         intrinsics=intrinsics,
-        notes=tuple(f"it has no {what}" for what, known in there.items() if not known)
+        notes=tuple(f"it has no {what}" for what, known in there.items() if known is None)
         + (DISTORTED,) * (meta.get("image_state") == "distorted_original"),
     )
 

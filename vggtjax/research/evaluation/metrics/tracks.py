@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from vggtjax.cameras import umeyama_sim3
 from vggtjax.errors import InputError, check_choice
+
+TrackAlign = Literal["median", "sim3"]
 
 _PIXELS = (1, 2, 4, 8, 16)  # of TAPVid-3D, in a picture whose shorter side has 256 pixels
 _METRES = (0.1, 0.3, 0.5, 1.0)  # of WorldTrack
@@ -69,7 +71,7 @@ def world_track_errors(
     predicted: Float[np.ndarray, "S N 3"],
     truth: Float[np.ndarray, "S N 3"],
     counted: Bool[np.ndarray, "S N"],
-    align: Literal["median", "sim3"] = "median",
+    align: TrackAlign = "median",
 ) -> WorldTrackErrors:
     """Return WorldTrack's errors (Feng et al. 2025, St4RTrack) of points in the world of the first camera.
 
@@ -82,7 +84,7 @@ def world_track_errors(
     Raises:
         InputError: different shapes, predictions that are not finite, no point, or with "sim3" points on one line.
     """
-    check_choice("align", align, ("median", "sim3"))
+    check_choice("align", align, get_args(TrackAlign))
     _checked(predicted, truth, counted)
     found, true = predicted[counted], truth[counted]
     if align == "sim3":
