@@ -7,6 +7,7 @@ it (`datasets/seq-id-maps` of its evaluation). Text: a sequence a line, as PoseD
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -82,7 +83,7 @@ def read_frames_list(path: Path, seed: int = 0) -> dict[str, Pinned]:
 def _lines(text: str) -> Iterator[tuple[str, list[int | str]]]:
     for words in map(str.split, text.splitlines()):
         if words and not words[0].startswith("#"):
-            yield words[0], [int(word) if word.isdecimal() and word == str(int(word)) else word for word in words[1:]]
+            yield words[0], [int(word) if re.fullmatch("0|[1-9][0-9]{0,8}", word) else word for word in words[1:]]
 
 
 def listed_sequences(path: Path, pinned: Mapping[str, Pinned], wanted: Iterable[str] | None) -> list[str]:
