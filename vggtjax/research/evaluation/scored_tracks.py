@@ -74,7 +74,7 @@ def _matched(
     for frame in np.unique(starts):
         shown, started = np.flatnonzero(visible[frame]), np.flatnonzero(starts == frame)
         if shown.size:
-            distances, nearest = KDTree(places[frame, shown]).query(positions[frame, started])
+            distances, nearest = map(np.asarray, KDTree(places[frame, shown]).query(positions[frame, started]))
             close = distances <= _SAME_POINT
             own |= dict(zip(shown[nearest[close]].tolist(), started[close].tolist(), strict=True))
     if not own:
