@@ -1,7 +1,8 @@
 """Numbers of public evaluations, run once on random poses, tracks and masks, and stored in tests/golden/evaluation.
 
 camera_pairs.npz: VGGT's evaluation/test_co3d.py (its author's commit 4b8be14b, as the fork yhomasti/vggt has it; the
-functions are those of facebookresearch/vggt 851d2571), Pi3's relpose/metric.py (yyfz/Pi3 97ce97b8), Depth Anything 3's bench/utils.py (ByteDance-Seed/Depth-Anything-3 2c21ea84), SuperGlue's models/utils.py
+functions are those of facebookresearch/vggt 851d2571), Pi3's relpose/metric.py (yyfz/Pi3 97ce97b8), Depth Anything 3's
+bench/utils.py (ByteDance-Seed/Depth-Anything-3 2c21ea84), SuperGlue's models/utils.py
 (magicleap/SuperGluePretrainedNetwork ddcf11f4). tracks.npz: TAPVid-3D's evaluation/metrics.py (google-deepmind/tapnet
 c2cbab81) and St4RTrack's dust3r/track_eval_util.py (a copy of HavenFeng/St4RTrack, zhaoliangzhang/St4RTrack 0a4ebfdd).
 masks_easi3r.npz: davis2017/evaluation.py of Easi3R (Inception3D/Easi3R 146a77d7), which mask_metric.py runs.
