@@ -138,7 +138,7 @@ def read_arrays(path: Path, names: Collection[str] | None = None) -> dict[str, n
             if names is not None and name not in names:
                 continue
             header = _read_header(file, member.filename, member.file_size)
-            if _is_mappable(member):
+            if _is_mappable(member) and header.dtype.kind != "S":  # bytes are read
                 arrays[name] = _mapped(path, member, file.tell(), header)
                 continue
             file.seek(0)

@@ -105,6 +105,14 @@ def test_bad_input_is_one_sentence_and_exit_code_2(sequences, tmp_path, capsys, 
     assert not (tmp_path / "out").exists()
 
 
+def test_a_list_that_names_missing_frames_is_one_sentence_and_exit_code_2(sequences, tmp_path, capsys):
+    listed = tmp_path / "frames.json"
+    listed.write_text('{"clip0": [0, 2], "clip1": [1, 99]}')
+    arguments = ("plain", sequences, "--frames-list", listed, *MODEL, "--out", tmp_path / "out")
+    assert f"{listed} names frame 99 of sequence clip1, which has" in refusal(capsys, "evaluate", *arguments)
+    assert not (tmp_path / "out").exists()
+
+
 def test_what_is_missing_is_said_once_with_its_path(tmp_path, capsys):
     """Whatever the number of methods; and the data set is looked at before matplotlib and the model are missed."""
     (tmp_path / "data/training/final/alley_2").mkdir(parents=True)

@@ -112,18 +112,27 @@ class ScoreOptions:
 
     Attributes:
         sequences: names, with commas; the sequences of the published protocol, or all, by default
+        frames_list: file with the frames of each sequence, numbers or names, in JSON or text as published; they are
+            taken in place of the protocol's, and its sequences alone
+        frames_seed: take ten random frames of each sequence, drawn by this seed; of those that a list names without
+            frames in any case
         gt: ground truth to use, where a data set has several: for dycheck easi3r (the default) or lidar
         depth_align: how video depth is brought to metres: by ten rounds towards the scale of the least absolute error,
             as MonST3R and CUT3R do it (scale); by that scale itself (least-absolute); by a scale and a shift; by
             medians; or not
+        pairs: whose AUC of the relative poses of all pairs: that of VGGT, Pi3 or Depth Anything 3 (da3), by bins of a
+            degree, or the exact one of papers on matching
         empty: J of a frame in which nothing moves and nothing is found: 1 (davis) or 0 (vggt4d)
         strict: refuse a sequence of which a frame lacks a picture, depth, mask, pose or result, or has a map of another
             size; the other frames are scored by default
     """
 
     sequences: Annotated[str | None, tyro.conf.arg(metavar="NAME,NAME", help_behavior_hint="")] = None
+    frames_list: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
+    frames_seed: Annotated[int | None, tyro.conf.arg(metavar="SEED", help_behavior_hint="")] = None
     gt: Annotated[str | None, tyro.conf.arg(metavar="{easi3r,lidar}", help_behavior_hint="")] = None
     depth_align: Literal["metric", "median", "scale", "least-absolute", "scale-shift"] = "scale"
+    pairs: Literal["vggt", "pi3", "da3", "matching"] = "vggt"
     empty: Literal["davis", "vggt4d"] = "davis"
     strict: Annotated[bool, tyro.conf.arg()] = False
 
@@ -141,7 +150,7 @@ def evaluate(
     scores: Annotated[ScoreOptions, tyro.conf.arg(name="score", help="")] = ScoreOptions(),
     out: EvaluationFolder,
 ) -> None:
-    """Score methods on a data set with ground truth: cameras, point clouds, masks, depth, uncertainty.
+    """Score methods on a data set with ground truth: cameras, point clouds, masks, depth, uncertainty, tracks.
 
     Finished sequences are kept: run the same command again to resume.
 
@@ -169,7 +178,14 @@ def evaluate(
 
             chosen = None if scores.sequences is None else _words(scores.sequences)
             found = find_sequences(
-                dataset, root, sequences=chosen, sampling=sampling, gt=scores.gt, strict=scores.strict
+                dataset,
+                root,
+                sequences=chosen,
+                sampling=sampling,
+                gt=scores.gt,
+                strict=scores.strict,
+                frames_list=scores.frames_list,
+                frames_seed=scores.frames_seed,
             )
             store = Records(out)
             check_report(out, store)
@@ -178,6 +194,9 @@ def evaluate(
         report.note(f"{len(found)} sequence{'' if len(found) == 1 else 's'}: {named}{more}")
         frames = chosen_frames(dataset, sampling)
         taken = _frames_in_words(frames, dataset if DATASETS[dataset].has_protocol else None, sampling)
+        if scores.frames_list is not None or scores.frames_seed is not None:
+            drawn = f"ten at random, by the seed {scores.frames_seed or 0}"
+            taken = f"frames: {drawn if scores.frames_list is None else f'those of {scores.frames_list}, or {drawn}'}"
         report.note(taken)
         if folders.results:
             for name, value in vars(candidates).items():
@@ -204,12 +223,13 @@ def evaluate(
             "depth_align": scores.depth_align,
             "max_depth": labels.max_depth,
             "empty": scores.empty,
+            "pairs": scores.pairs,
             "strict": scores.strict,
             **({} if folders.results else {"consistent_depth": options.consistent_depth}),
             **source.settings,
         }
         store.begin()
-        scoring = Scoring(scores.depth_align, labels.max_depth, scores.empty, scores.strict)
+        scoring = Scoring(scores.depth_align, labels.max_depth, scores.empty, scores.pairs, scores.strict)
         records = run(found, source, store, settings, scoring, on_stage=report.stage)
         with report.stage("draw"):
             write_report(out, records, store, settings, warnings=source.warnings)

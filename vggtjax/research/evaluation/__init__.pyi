@@ -1,6 +1,9 @@
 from .datasets import DATASETS as DATASETS
 from .datasets import find_sequences as find_sequences
 from .datasets.sequence import LabelledSequence as LabelledSequence
+from .metrics.camera_pairs import pair_angles as pair_angles
+from .metrics.camera_pairs import pair_scores as pair_scores
+from .metrics.camera_pairs import recall_area as recall_area
 from .metrics.depth import video_depth_errors as video_depth_errors
 from .metrics.masks import frame_scores as frame_scores
 from .metrics.masks import mask_scores as mask_scores
@@ -9,6 +12,8 @@ from .metrics.point_clouds import nearest_distances as nearest_distances
 from .metrics.point_clouds import normals_of as normals_of
 from .metrics.point_clouds import paired_distance as paired_distance
 from .metrics.point_clouds import point_cloud_errors as point_cloud_errors
+from .metrics.tracks import tapvid3d_scores as tapvid3d_scores
+from .metrics.tracks import world_track_errors as world_track_errors
 from .metrics.trajectory import associate as associate
 from .metrics.trajectory import trajectory_errors as trajectory_errors
 from .metrics.uncertainty import uncertainty_scores as uncertainty_scores

@@ -11,13 +11,15 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 from scipy.ndimage import map_coordinates
 
-from vggtjax.cameras import Similarity, checked_centres, umeyama_sim3
+from vggtjax.cameras import Similarity, checked_centres, umeyama_sim3, world_from_camera
 from vggtjax.errors import InputError
+from vggtjax.research.evaluation.metrics.camera_pairs import Pairs, pair_scores
 from vggtjax.research.evaluation.metrics.depth import Align, depth_alignment, video_depth_errors
 from vggtjax.research.evaluation.metrics.masks import Empty, auc, frame_scores, mask_statistics
 from vggtjax.research.evaluation.metrics.point_clouds import nearest_distances, paired_distance, statistics
 from vggtjax.research.evaluation.metrics.trajectory import trajectory_errors
 from vggtjax.research.evaluation.metrics.uncertainty import reliability_curve, sparsification_curve, uncertainty_scores
+from vggtjax.research.evaluation.scored_tracks import track_metrics
 from vggtjax.research.evaluation.truth_at_pixels import AbsentError, TruthAtPixels, known_points
 from vggtjax.results.frame import source_pixels
 from vggtjax.results.result import Result, missing_fields
@@ -38,7 +40,14 @@ class Scores(NamedTuple):
     curves: dict[str, np.ndarray]  # for the plots
 
 
-def score(result: Result, truth: TruthAtPixels, *, depth_align: Align = "scale", empty: Empty = "davis") -> Scores:
+def score(
+    result: Result,
+    truth: TruthAtPixels,
+    *,
+    depth_align: Align = "scale",
+    empty: Empty = "davis",
+    pairs: Pairs = "vggt",
+) -> Scores:
     """Score a result by each protocol of docs/reference/evaluation-protocols.md that the sequence has ground truth for.
 
     Args:
@@ -46,6 +55,7 @@ def score(result: Result, truth: TruthAtPixels, *, depth_align: Align = "scale",
         truth: of the sequence, at the pixels of this result.
         depth_align: alignment of video depth to the truth.
         empty: J of a frame in which neither mask has a pixel: 1 ("davis") or 0 ("vggt4d").
+        pairs: whose AUC of relative poses; see `pair_scores`.
 
     Returns:
         The metrics, all finite; notes and problems say why others are missing.
@@ -55,12 +65,14 @@ def score(result: Result, truth: TruthAtPixels, *, depth_align: Align = "scale",
     notes: list[str] = []
     problems: list[str] = []
     protocols: dict[str, Callable[[Result, TruthAtPixels], _Outputs]] = {
-        "trajectory": _trajectory,
+        "trajectory": partial(_trajectory, pairs=pairs),
         "point clouds": _point_clouds,
         "masks": partial(_masks, empty=empty),
         "video depth": partial(_video_depth, align=depth_align),
         "uncertainty": _uncertainty,
     }
+    if truth.sequence.tracks is not None:
+        protocols |= {name: partial(_tracks, dense=name != "tracks") for name in ("points along tracks", "tracks")}
     for name, protocol in protocols.items():
         try:
             values, drawn = protocol(result, truth)
@@ -89,12 +101,13 @@ def _check_any(known: np.ndarray) -> None:
         raise AbsentError("no pixel with a true depth has a predicted one")
 
 
-def _trajectory(result: Result, truth: TruthAtPixels) -> _Outputs:
+def _trajectory(result: Result, truth: TruthAtPixels, *, pairs: Pairs) -> _Outputs:
     poses = truth.poses
     errors = trajectory_errors(result.world_from_camera[truth.posed], poses)
+    of_pairs = pair_scores(result.camera_from_world[truth.posed], world_from_camera(poses[:, :3])[:, :3], pairs)
     similarity = _alignment(result, truth, allow_line=True)
     found = similarity.apply(result.camera_centres[truth.posed])
-    return errors._asdict(), {"centres": found, "true_centres": poses[:, :3, 3]}
+    return errors._asdict() | of_pairs, {"centres": found, "true_centres": poses[:, :3, 3]}
 
 
 def _alignment(result: Result, truth: TruthAtPixels, *, allow_line: bool = False) -> Similarity:
@@ -125,6 +138,10 @@ def _point_clouds(result: Result, truth: TruthAtPixels) -> _Outputs:
     for kind in ("mean", "median"):
         metrics[f"distance_chamfer_{kind}"] = (metrics[f"accuracy_{kind}"] + metrics[f"completeness_{kind}"]) / 2
     return metrics, curves
+
+
+def _tracks(result: Result, truth: TruthAtPixels, *, dense: bool) -> _Outputs:
+    return track_metrics(result, truth, dense=dense), {}
 
 
 def _masks(result: Result, truth: TruthAtPixels, *, empty: Empty) -> _Outputs:

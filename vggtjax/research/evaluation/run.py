@@ -14,6 +14,7 @@ from vggtjax.clips.captures.capture import OtherShapeError
 from vggtjax.errors import VggtjaxError, one_line, reading
 from vggtjax.progress import OnStage, StageSeconds, no_progress
 from vggtjax.research.evaluation.datasets.sequence import LabelledSequence, LeftOut, left_out
+from vggtjax.research.evaluation.metrics.camera_pairs import Pairs
 from vggtjax.research.evaluation.metrics.depth import Align
 from vggtjax.research.evaluation.metrics.masks import Empty
 from vggtjax.research.evaluation.protocol import score
@@ -35,6 +36,7 @@ class Scoring:
     depth_align: Align = "scale"
     max_depth: float | None = None
     empty: Empty = "davis"
+    pairs: Pairs = "vggt"
     strict: bool = False  # refuse a sequence of which a frame lacks something, rather than score the others
 
 
@@ -113,7 +115,7 @@ def _computed(
                 own, lacking = _matched(sequence, result)
                 if truth is None or truth.sequence is not own or not truth.fits(result):  # results with one share it
                     truth = TruthAtPixels(own, result, max_depth=scoring.max_depth, strict=scoring.strict)
-                scores = score(result, truth, depth_align=scoring.depth_align, empty=scoring.empty)
+                scores = score(result, truth, depth_align=scoring.depth_align, empty=scoring.empty, pairs=scoring.pairs)
                 lacking += tuple(truth.left_out.values())
                 said = tuple(f"{name} of {sequence.name}: {each.sentence}" for each in lacking)
                 sizes = tuple(f"{sequence.name}: {note}" for note in sequence.resized)

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from vggtjax.errors import one_line
+from vggtjax.research.evaluation.metrics.camera_pairs import THRESHOLDS
 from vggtjax.research.evaluation.records import Record
 
 
@@ -19,6 +20,13 @@ class Column(NamedTuple):
     heading: str
     better: str  # "lower" or "higher"; "" if neither
     form: str = ".3f"
+
+
+def _of_tracks(kind: str, words: str) -> tuple[Column, ...]:
+    names = {"apd": "APD", "aj": "AJ", "oa": "OA", "world_apd": "world APD", "sim3_apd": "Sim(3) APD"}
+    shares = [Column("Tracks", f"{kind}_{key}", f"{words} {name}", "higher") for key, name in names.items()]
+    names = {"world_epe": "world EPE", "sim3_epe": "Sim(3) EPE"}
+    return (*shares, *(Column("Tracks", f"{kind}_{key}", f"{words} {name}", "lower") for key, name in names.items()))
 
 
 # Tables 1 and 2 of the paper first: points, then cameras; then masks, video depth and uncertainty.
@@ -34,6 +42,7 @@ COLUMNS = (
     Column("Cameras", "ate", "ATE", "lower"),
     Column("Cameras", "rte", "RTE", "lower"),
     Column("Cameras", "rre", "RRE", "lower"),
+    *(Column("Cameras", f"auc_{limit}", f"AUC@{limit}", "higher") for limit in THRESHOLDS),
     Column("Dynamic masks", "j_mean", "J mean", "higher"),
     Column("Dynamic masks", "j_recall", "J recall", "higher"),
     Column("Dynamic masks", "f_mean", "F mean", "higher"),
@@ -49,6 +58,8 @@ COLUMNS = (
     Column("Uncertainty", "nll_calibrated", "NLL calibrated", "lower", ".2f"),
     Column("Uncertainty", "ece", "ECE", "lower"),
     Column("Uncertainty", "ece_calibrated", "ECE calibrated", "lower"),
+    *_of_tracks("tracks", "Tracks"),
+    *_of_tracks("dense", "Points along tracks"),
 )
 ARROWS = {"lower": "↓", "higher": "↑", "": ""}
 _LATEX_ARROWS = {"lower": r" $\downarrow$", "higher": r" $\uparrow$", "": ""}

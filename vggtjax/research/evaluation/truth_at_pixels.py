@@ -126,12 +126,17 @@ class TruthAtPixels:
         """Pixels with a true depth, in frames with a true camera."""
         return (self.depth > 0) & self.posed[:, None, None]
 
+    @property
+    def intrinsics(self) -> Float64[np.ndarray, "S 3 3"]:
+        """Of the frames, in pixels of the result."""
+        if self.sequence.intrinsics is None:
+            raise AbsentError("the sequence has no intrinsics")
+        return intrinsics_at_clip_pixels(self._placed, self.sequence.intrinsics)
+
     @cached_property
     def points(self) -> Float32[np.ndarray, "N 3"]:
         """Points in the true world of all pixels with a true depth, in frames with a true camera."""
-        if self.sequence.intrinsics is None:
-            raise AbsentError("the sequence has no intrinsics")
-        intrinsics = intrinsics_at_clip_pixels(self._placed, self.sequence.intrinsics)
+        intrinsics = self.intrinsics
         poses = np.tile(np.eye(4), (len(self.sequence), 1, 1))
         poses[self.posed] = self.poses
         if not self.shown.any():

@@ -1,5 +1,6 @@
 """The trees of folders on the page of protocols: files at these places, and no others, are a data set."""
 
+import io
 import json
 import re
 from collections.abc import Iterator
@@ -7,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from tests.shared import dataset_files as made
 from tests.shared.dataset_files import opened, write
@@ -21,6 +23,23 @@ TRANSFORMS = _CAMERA | {"frames": [_FRAME | {"transform_matrix": np.eye(4).tolis
 K = [[4.0, 0, 1.5], [0, 4.0, 1], [0, 0, 1]]
 
 
+JPEG = io.BytesIO()
+Image.new("RGB", (4, 3)).save(JPEG, "JPEG")
+VIDEO = io.BytesIO()
+np.savez(
+    VIDEO,
+    images_jpeg_bytes=[JPEG.getvalue()],
+    tracks_XYZ=np.array([[[0.0, 0, 2]]]),
+    visibility=np.ones((1, 1), bool),
+    fx_fy_cx_cy=np.array([4.0, 4, 2, 1.5]),
+)
+LABELLED = (
+    "Total number of regions:\n2\n\n0\n\n255\n\nConfusion penality matrix\n0 1\n1 0\n\nFrame number:\n0\nFile name:\n"
+    "camel01_0001_gt.pgm\n"
+)
+SCENE = {"depth_format": "uint16_png_div1000", "tags": {"dynamics": "dynamic"}}
+
+
 def _lines(says: str) -> str:
     """Return lines of a list of TUM, as many as bonn leaves out, and one more."""
     return "".join(f"{1341846313 + i / 30:.6f} {says}\n" for i in range(31))
@@ -28,6 +47,14 @@ def _lines(says: str) -> str:
 
 # What is in the files: the first pattern that the end of a path fits.
 CONTENTS = {
+    r"\.npz": VIDEO.getvalue(),
+    r"\.dat": LABELLED,
+    r"_gt\.pgm": b"P5\n4 3\n255\n" + bytes([255] * 12),
+    r"meta\.json": json.dumps(SCENE),
+    r"poses/.*\.npy": made.npy(np.eye(4)),
+    r"intrinsic\.npy": made.npy(np.array(K)),
+    r"GroundTruth/.*\.png": made.png(np.full((3, 4), 255, np.uint8)),
+    r"(camel01|JPEGImages/\w+)/\w+\.(jpg|png)": made.picture(),
     r"(Annotations|mask)/.*\.png": made.png(np.full((3, 4), 255, np.uint8)),
     r"(rgb|images|final|image_02/data|image_gathered|480p)/.*|color\.png": made.picture(),
     r"depth.*\.png": made.depth_png([[1000] * 4] * 3),
@@ -102,5 +129,6 @@ def test_files_of_a_tree_are_a_data_set(name, layout, gt, tmp_path):
             "masks": sequence.mask is not None and sequence.mask(0).any(),
             "poses": sequence.world_from_camera is not None,
             "intrinsics": sequence.intrinsics is not None,
+            "tracks": sequence.tracks is not None,
         }
         assert {kind for kind, is_there in truth.items() if is_there} >= set(DATASETS[name].truth)

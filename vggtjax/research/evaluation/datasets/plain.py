@@ -30,6 +30,7 @@ from vggtjax.clips.media.order import in_order
 from vggtjax.clips.media.times import in_seconds
 from vggtjax.errors import InputError, one_line
 from vggtjax.research.evaluation.datasets.folders import sequence_folders
+from vggtjax.research.evaluation.datasets.scene_tracks import scene_tracks
 from vggtjax.research.evaluation.datasets.sequence import (
     FrameChoice,
     LabelledSequence,
@@ -82,7 +83,7 @@ def takes(centres: Float64[np.ndarray, "S 3"]) -> list[range]:
 def _read(folder: Path, name: str, part: slice, frames: FrameChoice) -> LabelledSequence:
     pictures = _pictures(folder)
     known = _known_poses(folder, pictures)
-    chosen = frames.of(range(len(pictures))[part], name)
+    chosen = frames.of(range(len(pictures))[part], name, pictures[part])
     intrinsics = _intrinsics(folder, len(pictures), known.rows, known.lines)
     taken = [pictures[frame] for frame in chosen]
     depths, unread = _of_one_kind(folder / "depth", _DEPTH_FILES)
@@ -111,6 +112,9 @@ def _read(folder: Path, name: str, part: slice, frames: FrameChoice) -> Labelled
     else:
         notes += (f"it has no world_from_camera.txt; expected {folder / 'world_from_camera.txt'}",)
     notes += (f"it has no K.txt; expected {folder / 'K.txt'}",) * (intrinsics is None)
+    tracks = None
+    if poses is not None and intrinsics is not None and np.isfinite(poses).all():
+        tracks = scene_tracks(folder, [path.stem for path in taken], poses, intrinsics[chosen])
     return LabelledSequence(
         name,
         tuple(taken),
@@ -121,6 +125,7 @@ def _read(folder: Path, name: str, part: slice, frames: FrameChoice) -> Labelled
         None if (times := _times(pictures)) is None else times[chosen],
         notes=notes,
         left_out=gaps,
+        tracks=tracks,
     )
 
 

@@ -19,6 +19,8 @@ from vggtjax.clips.captures.pictures import PNG, opening, picture_size
 from vggtjax.clips.media.order import in_order
 from vggtjax.clips.media.sampling import Sampling
 from vggtjax.errors import InputError, one_line
+from vggtjax.research.evaluation.datasets.frames_list import Pinned
+from vggtjax.research.evaluation.datasets.true_tracks import TrueTracks
 
 T = TypeVar("T")
 DepthReader = Callable[[int], Float32[np.ndarray, "h w"]]
@@ -58,12 +60,16 @@ def left_out(
 
 
 class FrameChoice(NamedTuple):
-    """A window of frames, of which every `stride`-th is taken unless it is left out, and at most `most`."""
+    """A window of frames, of which every `stride`-th is taken unless it is left out, and at most `most`.
+
+    `pinned` frames are taken in place of all that.
+    """
 
     window: slice = slice(None)
     stride: int = 1
     most: int | None = None
     takes: Callable[[int], bool] = lambda frame: True  # by its number in the sequence
+    pinned: Pinned | None = None
 
     def sampled(self, sampling: Sampling) -> FrameChoice:
         """Return the frames of `sampling` within the window; its stride, if any, replaces this stride.
@@ -77,10 +83,16 @@ class FrameChoice(NamedTuple):
         takes = self.takes if sampling.skip is None else lambda frame: sampling.takes(frame - first)
         return FrameChoice(window if sampling.start else self.window, stride, min(mosts, default=None), takes)
 
-    def of(self, items: Sequence[T], name: str) -> list[T]:
-        """Return the chosen items, one for each frame of the sequence `name`; raises InputError if there is none."""
+    def of(self, items: Sequence[T], name: str, pictures: Sequence[Path] = ()) -> list[T]:
+        """Return the chosen items, one for each frame of the sequence `name`; raises InputError if there is none.
+
+        Pinned frames are named by the items, or by the pictures where the items have no names.
+        """
         if not items:
             raise InputError(f"sequence {name} has no frames; expected at least one")
+        if self.pinned is not None:
+            names = [item.stem if isinstance(item, Path) else str(item) for item in pictures or items]
+            return [items[place] for place in self.pinned.places(names, name)]
         count = len(items[self.window][:: self.stride])
         if not count:
             raise InputError(f"sequence {name} has {len(items)} frames, none of them from frame {self.window.start} on")
@@ -111,6 +123,8 @@ def unpictured(
     Pictures are `expected` there. A choice is made of the pictures that are there; the frames without count as left out
     where it would take them among all frames.
     """
+    if frames.pinned is not None:  # all of them are there
+        return ()
     named = [*pictures]
     lacking = {*truth} - {*named}
     wanted = frames.inside(in_order({*named} | lacking, Path))
@@ -137,6 +151,7 @@ class LabelledSequence:
     left_out: tuple[LeftOut, ...] = ()  # frames that lack something
     frame_names: tuple[str, ...] = ()  # the pictures' names without endings by default
     archive: object | None = None  # keeps the temporary files that `pictures` are, if any
+    tracks: TrueTracks | None = None
 
     def __post_init__(self) -> None:
         if not self.pictures:
@@ -179,7 +194,8 @@ class LabelledSequence:
             return None if values is None else values[list(chosen)]
 
         names = ("pictures", "depth", "mask", "world_from_camera", "intrinsics", "timestamps", "frame_names")
-        return replace(self, **{name: taken(getattr(self, name)) for name in names})
+        tracks = None if self.tracks is None else self.tracks.of_frames(chosen)
+        return replace(self, tracks=tracks, **{name: taken(getattr(self, name)) for name in names})
 
 
 Opener = Callable[[FrameChoice], LabelledSequence]

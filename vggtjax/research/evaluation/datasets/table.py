@@ -15,7 +15,9 @@ from vggtjax.research.evaluation.datasets import published
 from vggtjax.research.evaluation.datasets.captures import captures
 from vggtjax.research.evaluation.datasets.dycheck import TRUTHS, dycheck
 from vggtjax.research.evaluation.datasets.folders import listed
+from vggtjax.research.evaluation.datasets.frames_list import Pinned, PinnedError, listed_sequences, read_frames_list
 from vggtjax.research.evaluation.datasets.layouts import davis, kitti, seven_scenes, sintel
+from vggtjax.research.evaluation.datasets.motion_masks import fbms, segtrack
 from vggtjax.research.evaluation.datasets.plain import plain
 from vggtjax.research.evaluation.datasets.sequence import (
     EVERY_FRAME,
@@ -24,6 +26,8 @@ from vggtjax.research.evaluation.datasets.sequence import (
     Reader,
     refuse_left_out,
 )
+from vggtjax.research.evaluation.datasets.spatialbench import spatialbench
+from vggtjax.research.evaluation.datasets.tapvid3d import tapvid3d
 from vggtjax.research.evaluation.datasets.tum import bonn, tum
 
 logger = logging.getLogger(__name__)
@@ -35,7 +39,9 @@ class Dataset:
 
     reader: Reader
     description: str
-    truth: tuple[str, ...]  # of "depth", "poses", "intrinsics", "masks"; the notes of a sequence say what it lacks
+    truth: tuple[
+        str, ...
+    ]  # of "depth", "poses", "intrinsics", "masks", "tracks"; the notes of a sequence say what it lacks
     frames: FrameChoice = EVERY_FRAME
     sequences: tuple[str, ...] | None = None  # of the published protocol
     max_depth: float | None = None  # metres; the depth of farther pixels counts as unknown
@@ -53,6 +59,7 @@ class Dataset:
 
 
 _ROOM = ("depth", "poses", "intrinsics")
+_TRACKS = ("poses", "intrinsics", "tracks")
 
 DATASETS: Mapping[str, Dataset] = {
     "plain": Dataset(plain, "folders of rgb/, depth/, mask/, cameras; clips of vggtjax scenes", (*_ROOM, "masks")),
@@ -66,7 +73,13 @@ DATASETS: Mapping[str, Dataset] = {
     "kitti": Dataset(kitti, "KITTI drives", ("depth", "intrinsics"), FrameChoice(most=110), published.KITTI),
     "davis": Dataset(davis, "DAVIS 2016, validation", ("masks",), sequences=published.DAVIS_2016),
     "davis-2017": Dataset(davis, "DAVIS 2017, validation", ("masks",), sequences=published.DAVIS_2017),
+    "fbms": Dataset(fbms, "FBMS-59, moving objects", ("masks",)),
+    "segtrack": Dataset(segtrack, "SegTrack v2", ("masks",)),
     "7scenes": Dataset(seven_scenes, "7-Scenes", _ROOM),
+    "tapvid3d": Dataset(tapvid3d, "TAPVid-3D, points followed in 3-D", _TRACKS),
+    "worldtrack": Dataset(tapvid3d, "WorldTrack of St4RTrack", _TRACKS, FrameChoice(most=64)),
+    "spatialbench": Dataset(spatialbench, "SpatialBench, all scenes", _ROOM),
+    "spatialbench-dynamic": Dataset(partial(spatialbench, dynamics="dynamic"), "SpatialBench, dynamic scenes", _ROOM),
 }
 
 
@@ -78,6 +91,8 @@ def find_sequences(
     sampling: Sampling = Sampling(),
     gt: str | None = None,
     strict: bool = False,
+    frames_list: Path | None = None,
+    frames_seed: int | None = None,
 ) -> dict[str, Callable[[], LabelledSequence]]:
     """Find sequences of a data set; a call opens each of them, and raises errors of that sequence alone.
 
@@ -91,10 +106,13 @@ def find_sequences(
             stays. Pictures have no `fps`.
         gt: name of a ground truth, for a data set with several; the first if None.
         strict: refuse a sequence of which a frame lacks a picture, depth, mask or pose, or has a map of another size.
+        frames_list: a file with the frames of each sequence, as `datasets/frames_list.py` reads it: these frames and
+            sequences are taken, in place of those of `sampling` and of the published protocol.
+        frames_seed: draw ten frames of each sequence for which no list names any, by this seed; 0 in a list.
 
     Raises:
-        InputError: an unknown name, sequence or ground truth, or a root without sequences. The calls raise it for
-            missing or invalid files of their sequence.
+        InputError: an unknown name, sequence or ground truth, a root without sequences, or one that lacks frames of the
+            list. The calls raise it for missing or invalid files of their sequence.
     """
     if name not in DATASETS:
         raise InputError(f"data set {name!r} is not known; expected one of {', '.join(DATASETS)}")
@@ -108,18 +126,33 @@ def find_sequences(
         raise InputError(f"{root} is not a folder; expected the folder of the data set {name}")
     gt = gt or dataset.gt_default
     openers = dataset.reader(root, gt) if gt else dataset.reader(root)
+    pinned: Mapping[str, Pinned] = {}
+    if frames_list is not None:
+        pinned = read_frames_list(frames_list, frames_seed or 0)
+        sequences = listed_sequences(frames_list, pinned, sequences)
     chosen, notices = _chosen(name, root, list(openers), sequences)
+    if frames_list is None and frames_seed is not None:
+        pinned = {sequence: Pinned(seed=frames_seed) for sequence in chosen}
+    if pinned and dataclasses.asdict(sampling) != dataclasses.asdict(Sampling()):
+        raise InputError("a list or a seed of frames excludes start, stride, max_frames and skip; give one of them")
     for notice in notices:
         logger.warning("%s", notice)
     frames = chosen_frames(name, sampling)
 
     def opened(name: str) -> LabelledSequence:
         with reading(f"sequence {name}"):
-            sequence = openers[name](frames)
+            sequence = openers[name](frames._replace(pinned=pinned.get(name)))
             sequence = refuse_left_out(sequence) if strict else sequence
         said = (*sequence.notes, *(each.sentence for each in sequence.left_out))
         return dataclasses.replace(sequence, notes=(*notices, *(f"{sequence.name}: {note}" for note in said)))
 
+    for sequence in pinned and chosen:  # a list that a sequence lacks frames of is refused before anything is computed
+        try:
+            openers[sequence](frames._replace(pinned=pinned[sequence]))
+        except PinnedError:
+            raise
+        except InputError:  # its opener raises it when its turn comes
+            continue
     return {sequence: partial(opened, sequence) for sequence in chosen}
 
 

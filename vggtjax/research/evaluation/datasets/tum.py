@@ -83,7 +83,7 @@ def _read_tum(folder: Path, name: str, frames: FrameChoice) -> LabelledSequence:
         candidates = np.flatnonzero(posed >= 0)
         names = [pictures.paths[frame].stem for frame in lost]
         skipped = left_out("poses", names, len(posed), f"have no pose within {TOLERANCE} s and are skipped", usual=True)
-    chosen = frames.of(candidates.tolist(), name)
+    chosen = frames.of(candidates.tolist(), name, [pictures.paths[frame] for frame in candidates])
     notes += frames.shortage(len(candidates))
     intrinsics, more = read_intrinsics(folder)
     poses = None if poses is None else poses[posed[chosen]]
@@ -92,7 +92,7 @@ def _read_tum(folder: Path, name: str, frames: FrameChoice) -> LabelledSequence:
 
 def _read_bonn(folder: Path, name: str, frames: FrameChoice) -> LabelledSequence:
     pictures = read_list(folder, "rgb.txt")
-    chosen = frames.of(range(len(pictures.paths)), name)
+    chosen = frames.of(range(len(pictures.paths)), name, pictures.paths)
     notes = (*frames.shortage(len(pictures.paths)), DISTORTED)
     poses, posed = read_poses(folder, pictures.times)
     if poses is None:
