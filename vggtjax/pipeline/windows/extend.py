@@ -149,8 +149,8 @@ def extend(
             stack.enter_context(locked_folder(Path(out) / FOLDER, "the windows of a clip"))
             store = WindowStore(Path(out), settings)
             stack.enter_context(kept(lambda: f"{store.count()} windows are kept; the same command goes on from there"))
-        growth = _Growth(result, clip, names, extending)
-        grown = _extended(growth, tools, extending.windows, agree, store, on_stage)
+        growth = Growth(result, clip, names, extending)
+        grown = grow(growth, tools, extending.windows, agree, store, on_stage)
         if store is not None:
             store.remove()
     return without_mask(grown)
@@ -205,7 +205,7 @@ def _check_clip(result: Reconstruction, clip: Clip, names: list[str]) -> None:
         )
 
 
-class _Growth:
+class Growth:
     """The old result (node 0) and the windows of new frames (nodes 1, 2, ...), while they are run and joined."""
 
     def __init__(self, result: Reconstruction, clip: Clip, names: list[str], extending: Extending) -> None:
@@ -332,13 +332,13 @@ class _Growth:
         }
 
 
-def _extended(
-    growth: _Growth,
+def grow(
+    growth: Growth,
     tools: Tools,
     windows: Windows,
     agree: Callable[[Reconstruction, range, Clip], Reconstruction],
-    store: WindowStore | None,
-    on_stage: OnStage,
+    store: WindowStore | None = None,
+    on_stage: OnStage = no_stage,
 ) -> Reconstruction:
     """Choose anchors, run the windows, join them, and return the joined result."""
     clip, old = growth.clip, growth.nodes[0]
@@ -382,7 +382,7 @@ def _patches(tools: Tools, images: np.ndarray, progress: Progress | None) -> tup
     return np.stack(found), columns
 
 
-def _without_anchor(growth: _Growth, part: range, overlaps: Float64[np.ndarray, "M F"]) -> str:
+def _without_anchor(growth: Growth, part: range, overlaps: Float64[np.ndarray, "M F"]) -> str:
     named = f"the new frames {growth.names[part.start]} to {growth.names[part.stop - 1]}"
     if (best := overlaps.max()) >= LEAST_OVERLAP:
         return f"{named} overlap only with frames on which everything moves; expected anchors with something at rest"
