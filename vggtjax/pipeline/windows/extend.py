@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -45,7 +45,7 @@ from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.report import versions
 from vggtjax.results.result import ARRAYS, TRACKS, missing_fields, show_points
 from vggtjax.storage.interruption import kept
-from vggtjax.storage.writing import locked_folder
+from vggtjax.storage.writing import locked_folder, write_errors
 
 logger = logging.getLogger(__name__)
 
@@ -142,18 +142,31 @@ def extend(
         "options": options.to_json(),
         "versions": versions(),
     }
-    with ExitStack() as stack:
-        store = None
-        if out is not None:
-            Path(out).mkdir(parents=True, exist_ok=True)
-            stack.enter_context(locked_folder(Path(out) / FOLDER, "the windows of a clip"))
-            store = WindowStore(Path(out), settings)
-            stack.enter_context(kept(lambda: f"{store.count()} windows are kept; the same command goes on from there"))
-        growth = Growth(result, clip, names, extending)
-        grown = grow(growth, tools, extending.windows, agree, store, on_stage)
-        if store is not None:
+    growth = Growth(result, clip, names, extending)
+    if out is None:
+        return without_mask(grow(growth, tools, extending.windows, agree, None, on_stage))
+    with _kept_windows(Path(out), settings) as store:
+        return without_mask(grow(growth, tools, extending.windows, agree, store, on_stage))
+
+
+@contextmanager
+def _kept_windows(out: Path, settings: Mapping[str, Any]) -> Iterator[WindowStore]:
+    """Yield where windows are kept while they are run: until the end, or until the frames turn out not to fit."""
+    is_new = not out.is_dir()
+    with write_errors(out):
+        out.mkdir(parents=True, exist_ok=True)
+    with locked_folder(out / FOLDER, "the windows of a clip"):
+        store = WindowStore(out, settings)
+        try:
+            with kept(lambda: f"{store.count()} windows are kept; the same command goes on from there"):
+                yield store
+        except InputError:
             store.remove()
-    return without_mask(grown)
+            if is_new:
+                with suppress(OSError):
+                    out.rmdir()
+            raise
+        store.remove()
 
 
 def options_of(result: Reconstruction) -> Options:
