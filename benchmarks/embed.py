@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import io
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -16,21 +18,15 @@ from vggtjax.errors import InputError
 from vggtjax.network.backbone import patch_positions
 from vggtjax.network.checkpoint import Model, numpy_dtype, save_model
 from vggtjax.network.layers import Params
-from vggtjax.pipeline.pretrained.embedded import (
-    CLIP,
-    MODEL,
-    NOTE,
-    SCENE_SEED,
-    UNTRAINED_HEADS,
-    demo_model,
-    write_demo_clip,
-)
+from vggtjax.pipeline.pretrained.embedded import CLIP, MODEL, NEAREST, NOTE, STEP, UNTRAINED_HEADS, demo_model
 from vggtjax.pipeline.pretrained.load import load_model
 from vggtjax.research.evaluation.ladder import ladder
+from vggtjax.storage.writing import writing
 from vggtjax.training.scenes import SceneConfig, held_out_scenes
 
 MOST_MODEL_BYTES = 24 << 20
 MOST_CLIP_BYTES = 1 << 20
+SCENE_SEED = 100  # of held-out dynamic scenes; the clip is one of them; no evaluation uses this seed
 
 
 def embed(model: str, /, *, frames: int = 16, scenes: int = 45, image_size: int | None = None) -> None:
@@ -66,6 +62,22 @@ def embed(model: str, /, *, frames: int = 16, scenes: int = 45, image_size: int 
         if size > most:
             raise InputError(f"{path} has {size} bytes; at most {most} go into the package")
         console.print(f"{path}  {size} bytes  sha256 {hashlib.sha256(path.read_bytes()).hexdigest()}", soft_wrap=True)
+
+
+def write_demo_clip(path: Path, truth: Truth) -> None:
+    """Write a clip for `demo_clip`: colours in 8 bits, depth in 16 bits, the mask in 1 bit."""
+    steps = np.log(np.maximum(truth.depth, NEAREST) / NEAREST) / STEP
+    content = io.BytesIO()
+    np.savez_compressed(
+        content,
+        images=np.rint(255 * truth.images).astype(np.uint8),
+        log_depth=np.rint(np.minimum(steps, 65535)).astype(np.uint16),
+        dynamic_mask=np.packbits(truth.dynamic_mask),
+        camera_from_world=truth.camera_from_world.astype(np.float32),
+        intrinsics=truth.intrinsics.astype(np.float32),
+    )
+    with writing(path) as temporary:
+        temporary.write_bytes(content.getvalue())
 
 
 def _typical_scene(model: Model, truth: Truth) -> int:

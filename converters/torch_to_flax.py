@@ -76,14 +76,13 @@ class Target(NamedTuple):
     def parts(self, tensors: Mapping[str, Tensor]) -> Iterator[np.ndarray]:
         """Yield the target's parts, consecutive on axis 0, as views of the sources; one source is mapped at a time."""
         for source in self.sources:
-            part = self.transform(_finite(source, np.asarray(tensors[source])))
+            tensor = np.asarray(tensors[source])
+            if lost := tensor.size - np.count_nonzero(np.isfinite(tensor)):
+                raise CheckpointError(
+                    f"{lost} of {tensor.size} values of {source} are not finite; get the weights again"
+                )
+            part = self.transform(tensor)
             yield part[None] if self.stacked else part
-
-
-def _finite(name: str, tensor: np.ndarray) -> np.ndarray:
-    if lost := tensor.size - np.count_nonzero(np.isfinite(tensor)):
-        raise CheckpointError(f"{lost} of {tensor.size} values of {name} are not finite; get the weights again")
-    return tensor
 
 
 def convert_state_dict(state_dict: Mapping[str, np.ndarray], config: VGGTConfig) -> dict[str, Any]:

@@ -103,9 +103,7 @@ def zoomed(intrinsics: Float[np.ndarray, "S 3 3"], factor: float) -> Float[np.nd
 
 
 def project(
-    points: Float[np.ndarray, "N 3"],
-    camera_from_world: Float[np.ndarray, "3 4"],
-    intrinsics: Float[np.ndarray, "3 3"],
+    points: Float[np.ndarray, "N 3"], camera_from_world: Float[np.ndarray, "3 4"], intrinsics: Float[np.ndarray, "3 3"]
 ) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, " N"], Float[np.ndarray, " N"]]:
     """Return x and y in pixels, and depth, in the type of the points; x and y are only right where depth is above 0."""
     pose, K = camera_from_world.astype(points.dtype), intrinsics.astype(points.dtype)

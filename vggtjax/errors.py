@@ -147,11 +147,9 @@ def message_line(text: str) -> str:
 
 def printable(text: str) -> str:
     """Return text on one line: a space for each blank letter such as a line's end, ? for others that do not print."""
-    return text if text.isprintable() else "".join(map(_printable_letter, text))
-
-
-def _printable_letter(letter: str) -> str:
-    return letter if letter.isprintable() else " " if letter.isspace() else "?"
+    if text.isprintable():
+        return text
+    return "".join(letter if letter.isprintable() else " " if letter.isspace() else "?" for letter in text)
 
 
 def problems_sentence(subject: str, problems: Sequence[str]) -> str:

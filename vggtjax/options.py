@@ -47,12 +47,8 @@ class Method:
     mask: Witness = "gram"
 
     @property
-    def makes_mask(self) -> bool:
-        """Whether what moves is told apart; the mask is for the second pass."""
-        return self.needs_second_pass
-
-    @property
     def needs_second_pass(self) -> bool:
+        """Whether the second pass runs, and a mask of what moves is made for it."""
         return {self.depth, self.extrinsics, self.intrinsics} != {"first"}
 
     def second_outputs(self, align_scale: bool = False) -> tuple[str, ...]:

@@ -15,8 +15,9 @@ from typing import Any
 import jax
 import numpy as np
 
+from tests.shared.high_water import reset_high_water
 from vggtjax.network.precision import full_precision
-from vggtjax.storage.process_memory import process_bytes, reset_high_water
+from vggtjax.storage.host import process_bytes
 
 _SUSTAINED = 0.05  # seconds
 

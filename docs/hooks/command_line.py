@@ -6,8 +6,7 @@ import io
 import os
 from contextlib import redirect_stdout
 
-from vggtjax.interface.commands.main import COMMANDS, print_help
-from vggtjax.interface.commands.overview import overview
+from vggtjax.interface.commands.main import COMMANDS, overview, print_help
 
 MARK = "HELP OF EVERY COMMAND"  # in place of what plain Markdown shows: site.py
 _WIDTH = "100"

@@ -48,8 +48,7 @@ def with_signatures(page: Path, package: griffe.Module) -> str:
 
 def with_overview(text: str) -> str:
     """Return the text of a page with the overview that `vggtjax --help` prints, where it has a place for it."""
-    from vggtjax.interface.commands.main import COMMANDS
-    from vggtjax.interface.commands.overview import overview
+    from vggtjax.interface.commands.main import COMMANDS, overview
 
     shown = f"<!-- site: {EVERY_COMMAND} -->\n```text\n{overview(COMMANDS)}```\n<!-- /site -->"
     return re.sub(f"<!-- site: {EVERY_COMMAND} -->.*?<!-- /site -->", lambda _: shown, text, flags=re.DOTALL)

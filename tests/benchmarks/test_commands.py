@@ -9,6 +9,7 @@ import pytest
 from benchmarks import __main__ as benchmarks
 from benchmarks import command_worker, embed, static_mesh
 from tests.benchmarks.scenes import SIDE, drawn_scenes, tiny_file
+from vggtjax.clips.truth import Truth
 from vggtjax.errors import InputError
 from vggtjax.network.checkpoint import read_model
 from vggtjax.pipeline.pretrained.embedded import demo_clip
@@ -66,6 +67,23 @@ def test_what_a_command_takes(capfd, tmp_path):
 
 
 @pytest.mark.proof
+def test_a_clip_survives_the_file(tmp_path):
+    generator = np.random.default_rng(0)
+    truth = Truth(
+        images=generator.random((3, 8, 16, 3), np.float32),
+        depth=np.exp(generator.normal(size=(3, 8, 16))).astype(np.float32),
+        dynamic_mask=generator.random((3, 8, 16)) < 0.3,
+        camera_from_world=generator.normal(size=(3, 3, 4)).astype(np.float32),
+        intrinsics=generator.normal(size=(3, 3, 3)).astype(np.float32),
+    )
+    embed.write_demo_clip(tmp_path / "clip.npz", truth)
+    again = demo_clip(tmp_path / "clip.npz")
+    assert np.abs(again.images - truth.images).max() <= 0.5 / 255 + 1e-6
+    assert np.abs(again.depth / truth.depth - 1).max() < 4e-4
+    for name in ("dynamic_mask", "camera_from_world", "intrinsics"):
+        assert np.array_equal(getattr(again, name), getattr(truth, name))
+
+
 def test_embed(run, tiny, tmp_path, monkeypatch):
     for name in ("MODEL", "CLIP"):
         monkeypatch.setattr(embed, name, tmp_path / name)

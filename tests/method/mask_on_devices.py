@@ -20,8 +20,7 @@ from vggtjax.network.heads.pose import encode_pose
 from vggtjax.network.kernels.frames import BY_FRAME, Frames
 from vggtjax.network.kernels.gathered_attention import gathered_attention
 from vggtjax.network.model import Predictions
-from vggtjax.pipeline.devices import frames_mesh, shard_frames
-from vggtjax.pipeline.lengths import shared_length
+from vggtjax.pipeline.devices import frames_mesh, shard_frames, shared_length
 
 COUNT, SIZE = 13, (6, 8)  # frames, which eight devices pad to 16
 METHODS = {

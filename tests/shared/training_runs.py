@@ -9,10 +9,10 @@ import numpy as np
 from tests.shared.tiny import tiny_config
 from vggtjax.config import VGGTConfig
 from vggtjax.training import loop
-from vggtjax.training.devices import placement
 from vggtjax.training.loop import Task
 from vggtjax.training.metrics import read_metrics
 from vggtjax.training.recipe import OptimiserConfig, Phase, Recipe
+from vggtjax.training.run import placement
 from vggtjax.training.state import Metrics, TrainingState
 
 CONFIG = tiny_config(image_size=28, dpt_channels=(4, 4, 4, 4))

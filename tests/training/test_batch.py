@@ -18,10 +18,9 @@ from vggtjax.network.backbone import encode, patch_grid
 from vggtjax.network.heads.camera_head import predict_pose
 from vggtjax.network.model import init_params
 from vggtjax.network.suppression import Suppression
-from vggtjax.training.data import make_batch
+from vggtjax.training.data import make_batch, random_regions
 from vggtjax.training.objective import LossWeights, _flow_moments, init_probes, objective
 from vggtjax.training.recipe import Phase
-from vggtjax.training.regions import random_regions
 from vggtjax.training.truth import targets
 
 PHASE = Phase(1, 4, (2,), 28, 28, motion=(0.5, 1.0))

@@ -133,7 +133,7 @@ def test_frames_and_sizes_depend_on_seed_and_step_alone():
 CODE = """
 import dataclasses, jax, numpy as np
 from tests.shared.training_runs import RECIPE
-from vggtjax.training.devices import placement
+from vggtjax.training.run import placement
 def placed(*sizes):
     stages = tuple(dataclasses.replace(stage, batch=size) for stage, size in zip(RECIPE.stages, sizes))
     return placement(dataclasses.replace(RECIPE, stages=stages))

@@ -18,6 +18,7 @@ from PIL import Image, ImageOps
 from vggtjax.clips.captures.frames import CaptureFrames
 from vggtjax.clips.captures.lens import Undistortion
 from vggtjax.clips.clip import Clip
+from vggtjax.clips.fingerprint import file_digest
 from vggtjax.clips.media.images import (
     UNREADABLE,
     ImageFiles,
@@ -32,7 +33,6 @@ from vggtjax.clips.media.video import VideoFile
 from vggtjax.clips.sources import open_source
 from vggtjax.clips.truth import at_clip_pixels
 from vggtjax.errors import ClipError, InputError, reading
-from vggtjax.storage.file_digest import file_digest
 
 logger = logging.getLogger(__name__)
 
@@ -146,18 +146,13 @@ def _fitted(masks: np.ndarray, clip: Clip, loaded: Clip) -> Bool[np.ndarray, "S 
         return masks
     if masks.dtype == bool and masks.shape == loaded.images.shape[:3]:
         return np.stack([_resampled(mask, clip, i, partial(loaded.from_source, i)) for i, mask in enumerate(masks)])
-    if (
-        masks.dtype == bool
-        and masks.ndim == 3
-        and len(masks) == len(clip)
-        and all(_is_stored(masks.shape[:0:-1], clip, frame) for frame in range(len(clip)))
-    ):
+    fits = masks.dtype == bool and masks.ndim == 3 and len(masks) == len(clip)
+    if fits and all(_is_stored(masks.shape[:0:-1], clip, frame) for frame in range(len(clip))):
         return np.stack([_resampled(mask, clip, i, _to_mask(mask, clip, i)) for i, mask in enumerate(masks)])
-    if masks.dtype == bool and masks.ndim == 3 and len(masks) == len(clip) and {masks.shape[1:]} == sizes:
+    if fits and {masks.shape[1:]} == sizes:
         return at_clip_pixels(clip, masks)
     turns = [_turns(clip).get(name, 1) for name in clip.frame_names]
-    are_turned = masks.dtype == bool and masks.ndim == 3 and all(turn in _ACROSS for turn in turns)
-    if are_turned and len(masks) == len(clip) and {masks.shape[:0:-1]} == sizes:  # of the stored pixels
+    if fits and all(turn in _ACROSS for turn in turns) and {masks.shape[:0:-1]} == sizes:  # of the stored pixels
         return at_clip_pixels(clip, np.stack([turned(*pair) for pair in zip(masks, turns, strict=True)]))
     source = f" or {(len(clip), *sizes.pop())}, as the source's pictures" if len(sizes) == 1 else ""
     raise InputError(f"masks are {masks.dtype} {masks.shape}; expected bool {expected}, as the frames{source}")

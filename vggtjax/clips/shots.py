@@ -215,12 +215,8 @@ def _bright_runs(looks: Sequence[Look], kept: Sequence[int]) -> set[int]:
 def _distances(a: Look, b: Look) -> Float[np.ndarray, " 3"]:
     """Return how differently colours and brightness are spread, and how unlike the thumbnails are."""
     spreads = [1 - np.sqrt(x * y).sum() for x, y in zip(a.spreads, b.spreads, strict=True)]
-    return np.array([*spreads, 1 - _likeness(a, b)])
-
-
-def _likeness(a: Look, b: Look) -> float:
-    """Return the largest correlation of two thumbnails over shifts."""
-    return max(_correlation(a.thumbnail, b.thumbnail, y, x) for y in _SHIFTS for x in _SHIFTS)
+    likeness = max(_correlation(a.thumbnail, b.thumbnail, y, x) for y in _SHIFTS for x in _SHIFTS)
+    return np.array([*spreads, 1 - likeness])
 
 
 def _correlation(a: np.ndarray, b: np.ndarray, y: int, x: int) -> float:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterable
-from typing import TypeVar
 
 import numpy as np
 from jaxtyping import UInt8
@@ -15,9 +14,8 @@ from vggtjax.pipeline.refinement.dense import KNOWN, PREDICTED
 from vggtjax.pipeline.refinement.pixel_mask import mask_by_pixels
 from vggtjax.pipeline.refinement.refine import refine_with_points, warn_of_kept
 from vggtjax.progress import OnStage, no_stage
-from vggtjax.results.result import Result
+from vggtjax.results.result import AnyResult
 
-R = TypeVar("R", bound=Result)
 Pictures = Callable[[], Iterable[UInt8[np.ndarray, "h w 3"]]]
 
 
@@ -27,14 +25,14 @@ def agrees_with_pixels(options: Options) -> bool:
 
 
 def agree_with_pixels(
-    result: R,
+    result: AnyResult,
     pictures: Pictures,
     options: Options,
     *,
     known_poses: bool = False,
     known_intrinsics: bool = False,
     on_stage: OnStage = no_stage,
-) -> R:
+) -> AnyResult:
     """Return the result with refined cameras and consistent depth, if the options say so.
 
     Consistent depth starts from refined cameras, and takes their points, if both are wanted. A mask that was mined by

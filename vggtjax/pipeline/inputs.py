@@ -56,7 +56,11 @@ def read_inputs(
         given, mask_source = empty, "none: all frames are equal"
     else:
         given = None
-    geometry = _given_geometry(known, clip) if known else None
+    geometry = None
+    if known:
+        left_out = None if known.leave_out is None else load_masks(known.leave_out, clip)
+        capture = clip.source.capture if isinstance(clip.source, CaptureFrames) else None
+        geometry = read_known(known, clip, leave_out=left_out, capture=capture)
     return Inputs(clip, tracks, given, mask_source, geometry)
 
 
@@ -84,9 +88,3 @@ def check_tracks(model: Model) -> None:
     """Raise InputError for a model that follows no points."""
     if "tracks" not in model.heads:
         raise InputError(f"tracks need a model that follows points; this one has the heads {', '.join(model.heads)}")
-
-
-def _given_geometry(known: KnownGeometry, clip: Clip) -> Given:
-    masks = None if known.leave_out is None else load_masks(known.leave_out, clip)
-    capture = clip.source.capture if isinstance(clip.source, CaptureFrames) else None
-    return read_known(known, clip, leave_out=masks, capture=capture)

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 
 from vggtjax.errors import VggtjaxError, one_line
 from vggtjax.storage.cache import TRIALS, cache_folder
-from vggtjax.storage.cores import core_count
+from vggtjax.storage.host import core_count
 from vggtjax.storage.writing import writing
 
 _UNITS = {"amx_bf16", "avx512_bf16", "bf16"}  # as Linux names them: Intel's AMX; Intel and AMD; ARM
@@ -27,14 +27,14 @@ _FASTER = 1.5  # at least so many times as fast are products in bfloat16 where i
 _ROWS, _ROUNDS = 512, 5
 
 
-class Choice(NamedTuple):
+class DtypeChoice(NamedTuple):
     """A type for the transformer's products on a CPU, and why."""
 
     dtype: str
     reason: str
 
 
-def choose_dtype(channels: int) -> Choice | None:
+def choose_dtype(channels: int) -> DtypeChoice | None:
     """Return bfloat16 where this CPU multiplies it much faster, else float32; None for a model too small to gain.
 
     `channels` are those of the transformer's tokens. The trial takes about a third of a second, mostly to compile; the
@@ -44,13 +44,13 @@ def choose_dtype(channels: int) -> Choice | None:
         return None
     facts = _facts()
     if not any(_UNITS & set(values.split()) for name, values in facts if name in ("flags", "features")):
-        return Choice("float32", "this processor has no known unit for bfloat16")
+        return DtypeChoice("float32", "this processor has no known unit for bfloat16")
     try:
         gain = _kept_gain(facts, channels)
     except Exception as error:  # whatever fails, float32 works
-        return Choice("float32", f"the trial of bfloat16 failed: {one_line(str(error)) or type(error).__name__}")
+        return DtypeChoice("float32", f"the trial of bfloat16 failed: {one_line(str(error)) or type(error).__name__}")
     reason = f"this processor multiplies bfloat16 {gain:.1f} times as fast as float32"
-    return Choice("bfloat16" if gain >= _FASTER else "float32", reason)
+    return DtypeChoice("bfloat16" if gain >= _FASTER else "float32", reason)
 
 
 def _facts() -> list[tuple[str, str]]:

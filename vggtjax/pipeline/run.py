@@ -28,8 +28,7 @@ from vggtjax.network.kernels.frames import BY_FRAME, REPLICATED, Frames
 from vggtjax.network.surroundings import own_settings
 from vggtjax.options import Options
 from vggtjax.pipeline.agreement import agree_with_pixels, agrees_with_pixels
-from vggtjax.pipeline.arguments import check_kinds
-from vggtjax.pipeline.devices import frames_mesh, on_host, replicate, shard_frames
+from vggtjax.pipeline.devices import frames_mesh, on_host, padded_frames, replicate, shard_frames, shared_length
 from vggtjax.pipeline.fields import (
     assembled_fields,
     clip_fields,
@@ -41,14 +40,13 @@ from vggtjax.pipeline.fields import (
 from vggtjax.pipeline.inputs import GivenMasks, Inputs, read_inputs
 from vggtjax.pipeline.known.apply import apply_known, scaled
 from vggtjax.pipeline.known.options import KnownGeometry
-from vggtjax.pipeline.lengths import padded_frames, shared_length
 from vggtjax.pipeline.refinement.refine import check_refinement
-from vggtjax.pipeline.running import Running, changed
+from vggtjax.pipeline.running import Running, changed, check_kinds
 from vggtjax.pipeline.steps import Compile, Execute, StageMemory
 from vggtjax.progress import OnStage, Progress
-from vggtjax.results.no_mask import without_mask
 from vggtjax.results.not_finite import warn_of_not_finite
 from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.results.result import without_mask
 from vggtjax.storage.cache import hint_compilation_cache
 
 _LESS_MEMORY = (
@@ -236,7 +234,7 @@ def _arguments(
     params, rule = model.params, as_tree(fusion)
     if mesh is not None:
         params, rule = replicate((params, rule), mesh)
-    mines = options.row.makes_mask or agrees_with_pixels(options) or running.keep_passes or running.is_part
+    mines = options.row.needs_second_pass or agrees_with_pixels(options) or running.keep_passes or running.is_part
     moving: Array | Literal[False] | None = None if mines else False
     if masks is not None:
         moving = padded(masks) if masks.any() else False

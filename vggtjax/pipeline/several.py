@@ -16,15 +16,13 @@ from vggtjax.method.fusion.file import fusion_digest
 from vggtjax.network.checkpoint import Model
 from vggtjax.options import Options
 from vggtjax.pipeline.agreement import agree_with_pixels
-from vggtjax.pipeline.arguments import check_kinds
 from vggtjax.pipeline.fields import assembled_fields
 from vggtjax.pipeline.run import reconstruct, refined
-from vggtjax.pipeline.running import Running
+from vggtjax.pipeline.running import Running, check_kinds
 from vggtjax.pipeline.steps import Execute
 from vggtjax.progress import OnStage, no_stage
-from vggtjax.results.no_mask import without_mask
 from vggtjax.results.reconstruction import Reconstruction
-from vggtjax.results.result import FieldOfViewWarning
+from vggtjax.results.result import FieldOfViewWarning, without_mask
 
 
 def reconstruct_methods(

@@ -13,9 +13,8 @@ from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import jax
 
-from vggtjax.progress import OnStage, Progress, no_stage
-from vggtjax.storage.cores import core_count
-from vggtjax.storage.free_memory import return_freed_memory
+from vggtjax.progress import OnStage, Progress, no_progress, no_stage
+from vggtjax.storage.host import core_count, return_freed_memory
 
 _Parameters = ParamSpec("_Parameters")
 _Result = TypeVar("_Result")
@@ -52,11 +51,6 @@ class Execute:
         return run
 
 
-def count_collectives(program: str) -> dict[str, int]:
-    """Return the number of communications between devices in the text of a compiled program, by kind."""
-    return dict(Counter(_COLLECTIVE.findall(program)))
-
-
 class Compile:
     """Compiles steps side by side for the shapes of their arguments; equal programs once.
 
@@ -90,8 +84,7 @@ class Compile:
         programs = [compiling for compiling, _ in self._compiling.values()]
         for done, compiling in enumerate(as_completed(programs), 1):
             compiling.result()
-            if progress is not None:
-                progress(done, len(programs))
+            (progress or no_progress)(done, len(programs))
         memory = ((stage, _memory(compiling.result(), shared)) for stage, compiling, shared in self._steps)
         return {stage: needs for stage, needs in memory if needs is not None}
 
@@ -139,7 +132,7 @@ def _compilers() -> ThreadPoolExecutor:
 
 def _memory(compiled: Any, shared: bool) -> StageMemory | None:
     """Return the memory of a compiled stage, and its communications if devices share it; some platforms do not tell."""
-    collectives = count_collectives(compiled.as_text() or "") if shared else {}
+    collectives = dict(Counter(_COLLECTIVE.findall(compiled.as_text() or ""))) if shared else {}
     memory = compiled.memory_analysis()
     if memory is None:
         return None

@@ -106,7 +106,9 @@ def _draw(
     lines = _cameras(result, depth) if with_cameras else None
     shown, splats = -1, background_splats
     kept: dict[int, Splats] = {}
-    factor = _supersampling(background_splats, intrinsics[0, 0] / depth)
+    diameters = background_splats.diameters
+    width = intrinsics[0, 0] / depth * float(np.median(diameters)) if len(diameters) else 0.0  # of a disc, in pixels
+    factor = 1 if width > _WIDE else 2
     for number, frame in enumerate(due.tolist()):
         if frame != shown:
             if frame not in kept:  # the clip may be played again
@@ -118,12 +120,6 @@ def _draw(
         camera = Cameras(virtual.camera_from_world[number], virtual.intrinsics[number])
         yield draw_splats(splats, camera, size, background=background, near=_NEAR * depth, supersampling=factor)
         progress(number + 1, len(due))
-
-
-def _supersampling(splats: Splats, scale: float) -> int:
-    """Return how many pixels are drawn along a side of one; `scale` is the pixels of a length at the middle's depth."""
-    width = scale * float(np.median(splats.diameters)) if len(splats.diameters) else 0.0
-    return 1 if width > _WIDE else 2
 
 
 def middle_depth(cameras: Cameras, points: list[ShownPoints]) -> float:

@@ -115,9 +115,11 @@ def depth_picture(
     return np.asarray(picture.resize(enlarged(depth.shape), Image.Resampling.LANCZOS))
 
 
-def overlay_picture(image: UInt8[np.ndarray, "H W 3"], moving: UInt8[np.ndarray, "H W"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the overlay, enlarged to see it, with a sharp outline."""
-    size = enlarged(moving.shape)
+def overlay_picture(
+    image: UInt8[np.ndarray, "H W 3"], moving: UInt8[np.ndarray, "H W"], size: tuple[int, int] | None = None
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Return the overlay at this width and height, by default enlarged to see it, with a sharp outline of one width."""
+    size = size or enlarged(moving.shape)
     picture = Image.fromarray(image).resize(size, Image.Resampling.LANCZOS)
     return overlay(np.asarray(picture), np.asarray(Image.fromarray(moving).resize(size, Image.Resampling.NEAREST)))
 
@@ -174,7 +176,9 @@ def _rows(result: Result, shown: Int[np.ndarray, " F"], size: tuple[int, int]) -
     if result.has_mask:
         objects = int(result.instances.max())
         notes = f"{result.dynamic_share:.1%} of pixels\n{objects} object{'' if objects == 1 else 's'}"
-        rows.append(Row("Dynamic", [_overlaid(result, int(frame), size) for frame in shown], notes))
+        ids = moving_ids(result.dynamic_mask[shown], result.instances[shown])
+        overlaid = [overlay_picture(*frame, size) for frame in zip(result.images[shown], ids, strict=True)]
+        rows.append(Row("Dynamic", overlaid, notes))
     return rows
 
 
@@ -182,10 +186,3 @@ def _heat(values: Float[np.ndarray, "h w"], size: tuple[int, int]) -> UInt8[np.n
     """Colour numbers of patches from 0 to 1, enlarged before: mixed colours would lie beside the ramp."""
     patches = Image.fromarray(np.nan_to_num(values).clip(0, 1).astype(np.float32))
     return SALIENCY_COLORS[(np.asarray(patches.resize(size, Image.Resampling.BILINEAR)) * 255).round().astype(np.uint8)]
-
-
-def _overlaid(result: Result, frame: int, size: tuple[int, int]) -> UInt8[np.ndarray, "H W 3"]:
-    """Overlay moving objects at the size of the sheet, for outlines of one width."""
-    moving = Image.fromarray(moving_ids(result.dynamic_mask[frame], result.instances[frame]))
-    picture = Image.fromarray(result.images[frame]).resize(size, Image.Resampling.LANCZOS)
-    return overlay(np.asarray(picture), np.asarray(moving.resize(size, Image.Resampling.NEAREST)))

@@ -90,13 +90,7 @@ class Reconstruction(Result):
         return Viewer(viewer_page([self, *others], names=names), height)
 
     @classmethod
-    def load(
-        cls,
-        path: str | Path,
-        *,
-        format: str = "vggtjax",
-        quaternion: Quaternion | None = None,
-    ) -> Reconstruction:
+    def load(cls, path: str | Path, *, format: str = "vggtjax", quaternion: Quaternion | None = None) -> Reconstruction:
         """Read a result back from its folder, or from its reconstruction.npz; or the folder of another program.
 
         Args:

@@ -6,7 +6,6 @@ import json
 import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -23,6 +22,7 @@ from vggtjax.results.result import Result, missing_fields
 from vggtjax.results.thumbnail import moving_thumbnail
 from vggtjax.storage.arrays import spread_frames
 from vggtjax.storage.markup import data_uri, render, webp
+from vggtjax.storage.versions import installed_version
 
 REPORT_NAME = "report.html"
 _STRIP_FRAMES = 8
@@ -80,12 +80,8 @@ def versions() -> dict[str, str]:
     from vggtjax import __version__
 
     found = {"vggtjax": __version__, "Python": platform.python_version()}
-    for name in ("jax", "numpy"):
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return found
+    found |= {name: installed_version(name) for name in ("jax", "numpy")}
+    return {name: said for name, said in found.items() if said is not None}
 
 
 def report_page(folder: Path, result: Result, facts: RunFacts | None = None) -> str:
@@ -190,7 +186,7 @@ def _strip(result: Result) -> dict[str, Any]:
         pictures = [data_uri(webp(draw(frame), _THUMBNAIL)) for frame in shown]
         return {"label": label, "what": what, "pictures": pictures, "note": note, "ramp": ""} | ramp
 
-    times = None if result.timestamps is None else result.timestamps
+    times = result.timestamps
     return {
         "frames": [
             {

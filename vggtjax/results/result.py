@@ -6,10 +6,10 @@ import json
 import re
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from decimal import Decimal
 from functools import cached_property
-from typing import Any, get_args, get_type_hints
+from typing import Any, TypeVar, get_args, get_type_hints
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int, Int64, UInt8
@@ -271,6 +271,7 @@ def _arrays() -> dict[str, tuple[np.dtype, tuple[str | int, ...]]]:
     }
 
 
+AnyResult = TypeVar("AnyResult", bound=Result)  # also a Reconstruction: what is given comes back in its own class
 ARRAYS = _arrays()  # S, H, W are those of depth, h, w of saliency, Q of track_frames; all others must match
 TRACKS = frozenset(name for name in ARRAYS if name.startswith("track_"))  # all are given, or none
 OPTIONAL = TRACKS | {"timestamps", "saliency", "motion"}
@@ -287,7 +288,16 @@ def missing_fields(result: Result) -> tuple[str, ...]:
 def makes_no_mask(result: Result) -> bool:
     """Return whether a method of ours made the result and makes no mask, and none was given."""
     is_made_up = str(result.settings.get("masks")).startswith(("mined", "none"))
-    return is_made_up and result.method in METHODS and not METHODS[result.method].makes_mask
+    return is_made_up and result.method in METHODS and not METHODS[result.method].needs_second_pass
+
+
+def without_mask(result: AnyResult) -> AnyResult:
+    """Return the result of a method that makes no mask without mask, saliency and motion; others as they are."""
+    if not makes_no_mask(result):
+        return result
+    settings = result.settings | {"masks": f"none: {result.method} makes no mask"}
+    nothing = np.zeros(result.dynamic_mask.shape, bool)
+    return replace(result, dynamic_mask=nothing, saliency=None, motion=None, settings=settings)
 
 
 def inside_box(box: Int[np.ndarray, "*F 4"], size: tuple[int, ...]) -> Bool[np.ndarray, "*F H W"]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from functools import cache
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 _PACKAGE = Path(__file__).parents[1]
@@ -16,6 +16,14 @@ def _package_digest() -> str:
     for path in sorted(_PACKAGE.rglob("*.py")):
         digest.update(str(path.relative_to(_PACKAGE)).encode() + path.read_bytes())
     return digest.hexdigest()
+
+
+def installed_version(package: str) -> str | None:
+    """Return the version of a package; None for one that is not installed."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
 
 
 @cache
@@ -31,7 +39,7 @@ def source_digest() -> str:
     """Return versions, platform, cores, and a digest of all sources: what results depend on besides arguments."""
     import jax
 
-    from vggtjax.storage.cores import core_count
+    from vggtjax.storage.host import core_count
 
     versions = [version(name) for name in ("jax", "jaxlib", "flax")]
     return f"{' '.join(versions)} {jax.default_backend()} {core_count()} {_package_digest()}"

@@ -132,20 +132,19 @@ def write_errors(path: Path) -> Iterator[None]:
     except OutputError:
         raise
     except OSError as error:
-        blocking = _blocking(path) if isinstance(error, FileExistsError | NotADirectoryError) else None
-        reason = f"{blocking} is {_kind(blocking)}" if blocking else error.strerror or error
+        blocked = _blocked(path) if isinstance(error, FileExistsError | NotADirectoryError) else ""
+        reason = blocked or error.strerror or error
         raise OutputError(f"cannot write {path}: {reason}; choose a folder that is writable and has space") from error
 
 
-def _blocking(path: Path) -> Path | None:
-    """Return the path, or a parent of it, that exists and is no folder."""
-    return next((part for part in (path, *path.parents) if os.path.lexists(part) and not part.is_dir()), None)
-
-
-def _kind(path: Path) -> str:
-    if path.is_symlink() and not path.exists():
-        return f"a link to {path.readlink()}, which does not exist"
-    return "a file" if path.is_file() else "not a folder"
+def _blocked(path: Path) -> str:
+    """Return in words that the path, or a parent of it, exists and is no folder; nothing where all are folders."""
+    for part in (path, *path.parents):
+        if os.path.lexists(part) and not part.is_dir():
+            if part.is_symlink() and not part.exists():
+                return f"{part} is a link to {part.readlink()}, which does not exist"
+            return f"{part} is {'a file' if part.is_file() else 'not a folder'}"
+    return ""
 
 
 @contextmanager

@@ -21,13 +21,12 @@ from vggtjax.network.checkpoint import Model
 from vggtjax.network.layers import Params
 from vggtjax.storage.writing import locked_folder
 from vggtjax.training.data import make_batch as make_scene_batch
-from vggtjax.training.devices import placement
 from vggtjax.training.metrics import Row
 from vggtjax.training.objective import init_probes as init_scene_probes
 from vggtjax.training.objective import objective as scene_objective
 from vggtjax.training.options import RunOptions
 from vggtjax.training.recipe import Phase, Recipe
-from vggtjax.training.run import Run, labels_of
+from vggtjax.training.run import Run, labels_of, placement
 from vggtjax.training.scenes.textures import load_textures
 from vggtjax.training.start import adapted
 from vggtjax.training.state import Metrics, Objective, TrainingState, apply_gradient, loss_and_gradient

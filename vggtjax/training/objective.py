@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
@@ -10,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from vggtjax.config import VGGTConfig
+from vggtjax.config import Suppress, VGGTConfig
 from vggtjax.network.aggregator import Aggregator
 from vggtjax.network.backbone import encode, patch_grid
 from vggtjax.network.heads.camera_head import predict_pose
@@ -19,14 +20,41 @@ from vggtjax.network.heads.pose import quaternion_to_matrix
 from vggtjax.network.layers import LayerNorm, Params
 from vggtjax.network.model import HEADS, tap_patches
 from vggtjax.network.precision import Compute, full_precision
+from vggtjax.network.suppression import Suppression
 from vggtjax.storage.json_values import Natural, NotNegative, check_fields
-from vggtjax.training.batch import Batch
 from vggtjax.training.matching import MatchLoss
+from vggtjax.training.scenes.render import SyntheticClip
 from vggtjax.training.truth import MatchCounts, Matches, Targets, match_counts, matches, targets
 
 PATCH_PROBE = 6  # position in the first frame (2), logarithm of depth (1), point in the first camera's frame (3)
 CAMERA_PROBE = 7 + 10  # translation (3), quaternion (4), moments of the flow from the first frame
 CONFIDENCE = 0.2  # weight of the logarithm of confidence, as in VGGT
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=("clips", "regions", "pairs"), meta_fields=("suppress",))
+@dataclass(frozen=True)
+class Batch:
+    """The clips of a step, and the random regions in which their keys are suppressed: a pytree.
+
+    Attributes:
+        clips: the clips and their truth.
+        regions: pixels of suppressed patches; None for no suppression in any clip.
+        pairs: share of the pairs of blocks, from the first, that suppress keys, in (0, 1]; the same for all clips.
+        suppress: how keys are suppressed; static under jit.
+    """
+
+    clips: SyntheticClip
+    regions: Bool[Array, "B S H W"] | None = None
+    pairs: Float[Array, " B"] | None = None
+    suppress: Suppress = "zero"
+
+    def suppression(self, config: VGGTConfig) -> Suppression:
+        """Return the suppression of the network's keys: a patch is suppressed if its middle pixel is."""
+        if self.regions is None or self.pairs is None:
+            return Suppression()
+        middle = slice(config.patch_size // 2, None, config.patch_size)
+        pairs = jnp.ceil(self.pairs[0] * config.depth).astype(jnp.int32)
+        return Suppression(self.regions[:, :, middle, middle], self.suppress, pairs)
 
 
 @dataclass(frozen=True)

@@ -1,15 +1,17 @@
-"""The bookkeeping of a training run: its state, averages, checkpoints, tables and exported model."""
+"""The bookkeeping of a training run: its devices, state, averages, checkpoints, tables and exported model."""
 
 from __future__ import annotations
 
 import logging
+import math
 import time
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from vggtjax.errors import CheckpointError, VggtjaxError
 from vggtjax.network.checkpoint import Model, numpy_dtype, save_model
@@ -17,7 +19,6 @@ from vggtjax.network.layers import Params
 from vggtjax.network.model import HEADS
 from vggtjax.storage.writing import writing
 from vggtjax.training import checkpoints
-from vggtjax.training.devices import placement
 from vggtjax.training.metrics import Averages, Row, plot, read_metrics, write_metrics
 from vggtjax.training.options import RunOptions
 from vggtjax.training.recipe import Phase, Recipe
@@ -27,6 +28,26 @@ MOST_SKIPPED = 50  # steps in a row that may be skipped
 _PLOT_SECONDS = 180.0
 
 logger = logging.getLogger(__name__)
+
+
+class Placement(NamedTuple):
+    """Shardings of replicated arrays, and of arrays with the batch as first axis."""
+
+    whole: NamedSharding
+    by_clip: NamedSharding
+
+
+def placement(recipe: Recipe) -> Placement:
+    """Return shardings over the largest number of this machine's devices that divides the batch of every phase.
+
+    A CPU counts as one device unless XLA_FLAGS=--xla_force_host_platform_device_count=N splits it, which keeps more of
+    its cores busy with small models.
+    """
+    devices = jax.local_devices()
+    batches = math.gcd(*(phase.batch for phase in recipe.stages))
+    count = max(n for n in range(1, len(devices) + 1) if batches % n == 0)
+    mesh = Mesh(np.array(devices[:count]), ("clips",))
+    return Placement(NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec("clips")))
 
 
 def labels_of(recipe: Recipe, init: Model | Params | None, note: str) -> dict[str, Any]:

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from vggtjax import load_model
-from vggtjax.clips.truth import Truth
 from vggtjax.errors import CheckpointError, ClipError
 from vggtjax.pipeline.pretrained import embedded as demo
 from vggtjax.training.scenes.held_out import MOVERS
@@ -36,23 +35,6 @@ def test_the_clip_fits_the_model_and_moves():
     assert MOVERS[0] <= clip.dynamic_mask.mean() <= MOVERS[1]
     rotation = clip.camera_from_world[:, :, :3]
     assert np.allclose(rotation @ rotation.transpose(0, 2, 1), np.eye(3), atol=1e-5)
-
-
-def test_a_clip_survives_the_file(tmp_path):
-    generator = np.random.default_rng(0)
-    truth = Truth(
-        images=generator.random((3, 8, 16, 3), np.float32),
-        depth=np.exp(generator.normal(size=(3, 8, 16))).astype(np.float32),
-        dynamic_mask=generator.random((3, 8, 16)) < 0.3,
-        camera_from_world=generator.normal(size=(3, 3, 4)).astype(np.float32),
-        intrinsics=generator.normal(size=(3, 3, 3)).astype(np.float32),
-    )
-    demo.write_demo_clip(tmp_path / "clip.npz", truth)
-    again = demo.demo_clip(tmp_path / "clip.npz")
-    assert np.abs(again.images - truth.images).max() <= 0.5 / 255 + 1e-6
-    assert np.abs(again.depth / truth.depth - 1).max() < 4e-4
-    for name in ("dynamic_mask", "camera_from_world", "intrinsics"):
-        assert np.array_equal(getattr(again, name), getattr(truth, name))
 
 
 def test_a_broken_installation_says_so(monkeypatch, tmp_path):

@@ -16,7 +16,7 @@ from vggtjax.options import Options
 from vggtjax.pipeline.windows.frames import SeenFrames, window_clips
 from vggtjax.pipeline.windows.plan import Windows, plan_windows
 from vggtjax.pipeline.windows.run import LongRun, reconstruct_long, tools_of
-from vggtjax.pipeline.windows.tracks import Start, Tracked, follow_points
+from vggtjax.pipeline.windows.tracks import Tracked, TrackStart, follow_points
 from vggtjax.results.saving import Saving
 
 FRAMES = 50
@@ -121,7 +121,7 @@ def test_the_network_follows_points_as_in_a_clip_that_is_run_at_once():
     follow = tools_of(model, Options("vggt")).follow
     assert follow is not None
     assert at_once.track_positions is not None
-    found = follow(clip.images, [Start(2, points)])[0]
+    found = follow(clip.images, [TrackStart(2, points)])[0]
     assert np.abs(found.positions - at_once.track_positions).max() < 1e-4
     assert np.abs(found.visibility - at_once.track_visibility).max() < 1e-5
 

@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tests.shared.generated import QUICK, textures
+from tests.shared.walks import closed_walk
 from vggtjax.cameras import Similarity, align
 from vggtjax.clips.clip import Clip
 from vggtjax.clips.preprocessing import Fitter
@@ -16,7 +17,7 @@ from vggtjax.pipeline.windows.plan import Windows
 from vggtjax.pipeline.windows.run import LongRun, Tools
 from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.saving import Saving
-from vggtjax.training.scenes import SceneConfig, closed_walk, render, sample_scene
+from vggtjax.training.scenes import SceneConfig, render, sample_scene
 
 FRAMES = 60
 SETTINGS = {"seed": 0}  # that decide the windows

@@ -172,15 +172,17 @@ class Capture:
         return values if undone is None else undone.nearest(values)
 
 
-def there(pictures: Sequence[Path], source: Path, *, whole: bool) -> list[int]:
-    """Return the places of the pictures that are there; all of them for a `whole` capture, whose sizes are checked.
+def there(pictures: Sequence[Path], source: Path, *, whole: bool) -> tuple[list[int], tuple[str, ...]]:
+    """Return the places of the pictures that are there, and the names of the others.
+
+    For a `whole` capture all count as there, and `checked_sizes` refuses a missing one.
 
     Raises InputError where none is there.
     """
     found = [place for place, path in enumerate(pictures) if whole or path.is_file()]
     if pictures and not found:
         raise InputError(f"{pictures[0]} is missing, and so is every picture that {source} names")
-    return found
+    return found, tuple(path.stem for place, path in enumerate(pictures) if place not in found)
 
 
 def checked_sizes(pictures: Sequence[Path], source: Path) -> tuple[tuple[int, int], ...]:

@@ -106,8 +106,7 @@ def read_colmap(folder: Path, *, whole: bool = True) -> Capture:
     names = in_order(views, Path)
     place = _pictures(folder, names[0])
     pictures = tuple(inside(place, name, source) for name in names)
-    kept = there(pictures, source, whole=whole)
-    absent = tuple(picture.stem for number, picture in enumerate(pictures) if number not in kept)
+    kept, absent = there(pictures, source, whole=whole)
     names, pictures = [names[number] for number in kept], tuple(pictures[number] for number in kept)
     sizes = checked_sizes(pictures, source)
     taken = [views[name] for name in names]

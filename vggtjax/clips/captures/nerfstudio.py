@@ -49,8 +49,7 @@ def read_nerfstudio(folder: Path, *, whole: bool = True) -> Capture:
     pictures = tuple(picture for picture, _ in found)
     if len(set(pictures)) < len(pictures):
         raise InputError(f"{path} names a picture twice; expected each once")
-    kept = there(pictures, path, whole=whole)
-    absent = tuple(picture.stem for place, picture in enumerate(pictures) if place not in kept)
+    kept, absent = there(pictures, path, whole=whole)
     found, pictures = [found[place] for place in kept], tuple(pictures[place] for place in kept)
     sizes = checked_sizes(pictures, path)
     # Numbers of a frame come before those of all.

@@ -108,8 +108,7 @@ def read_tum(folder: Path, *, whole: bool = True) -> Capture:
     lost = [listed.paths[frame].stem for frame in np.setdiff1d(np.arange(count), frames)]
     missing = left_out(lost, count, f"pose within {TOLERANCE} s")
     notes = missing + (NO_POSES,) * (poses is None)
-    kept = there([listed.paths[frame] for frame in frames], folder / "rgb.txt", whole=whole)
-    absent = tuple(listed.paths[frame].stem for place, frame in enumerate(frames) if place not in kept)
+    kept, absent = there([listed.paths[frame] for frame in frames], folder / "rgb.txt", whole=whole)
     frames = frames[kept]
     pictures = tuple(listed.paths[frame] for frame in frames)
     sizes = checked_sizes(pictures, folder / "rgb.txt")

@@ -17,6 +17,7 @@ _UNKNOWN = (None, 0, 2, 3)
 _UNKNOWN_MATRIX = (None, 2, 3)  # 0 is RGB
 _BT709, _BT2020, _P3, _PQ, _HLG = 1, 9, 12, 16, 18
 _LIGHTNESS_ONLY = (14, 15)  # ICtCp and IPT, as in Dolby Vision's profile 5, are not YCbCr
+_SWSCALE = {6: 5, 10: _BT2020}  # swscale has one number for both forms of BT.601, and one for both of BT.2020
 _HD_LINES, _HD_COLUMNS = 720, 1280  # from either on, a video without tags is BT.709; below, swscale takes BT.601
 
 _WHITE = 203  # nits of SDR's white in HDR (ITU-R BT.2408)
@@ -88,7 +89,7 @@ def tags(decoder: VideoCodecContext) -> tuple[int, int, int]:
 
 def rgb_pixels(frame: VideoFrame, colours: Colours) -> np.ndarray:
     """Return the pixels of a frame as sRGB, uint8 [H, W, 3]. Raises what the decoder raises."""
-    matrix = None if colours.matrix in (None, frame.colorspace) else _swscale(colours.matrix)
+    matrix = None if colours.matrix in (None, frame.colorspace) else _SWSCALE.get(colours.matrix, colours.matrix)
     if colours.is_plain and any(component.is_alpha for component in frame.format.components):
         clear = Image.fromarray(frame.to_ndarray(format="rgba", src_colorspace=matrix))
         on_white = Image.alpha_composite(Image.new("RGBA", clear.size, "white"), clear)  # as transparent pictures
@@ -102,11 +103,6 @@ def srgb_of_coded(pixels: np.ndarray, transfer: int, primaries: int) -> tuple[np
     """Return the pixels of an HDR picture, uint16 [H, W, 3], as sRGB in 8 bits, and what was done."""
     colours = Colours(None, transfer, _BT2020 if primaries in _UNKNOWN else primaries)
     return _to_srgb(pixels, colours), colours.note or ""
-
-
-def _swscale(matrix: int) -> int:
-    """Return swscale's number of a matrix: it has one for both forms of BT.601 and one for both of BT.2020."""
-    return {6: 5, 10: _BT2020}.get(matrix, matrix)
 
 
 def _to_srgb(pixels: np.ndarray, colours: Colours) -> np.ndarray:

@@ -18,15 +18,8 @@ from vggtjax.errors import InputError, one_line, reading
 
 logger = logging.getLogger(__name__)
 
-LISTS = (
-    "timestamps.txt",
-    "timestamp.txt",
-    "times.txt",
-    "timestamps.csv",
-    "timestamp.csv",
-    "times.csv",
-    "data.csv",
-)  # in any case
+# Names of lists of times, in any case of letters.
+LISTS = ("timestamps.txt", "timestamp.txt", "times.txt", "timestamps.csv", "timestamp.csv", "times.csv", "data.csv")
 _UNITS = {"seconds": 0, "milliseconds": 3, "microseconds": 6, "nanoseconds": 9}  # digits after the point of a second
 _SHORT = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 _STATED = re.compile(r"[\[(](s|ms|us|ns)[\])]")  # a unit, as in "#timestamp [ns]"

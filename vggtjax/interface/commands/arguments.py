@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 from vggtjax.clips.preprocessing import Framing
-from vggtjax.interface.commands.flags import InWords, Switch
+from vggtjax.interface.commands.flags import InWords, Switch, in_group, option
 from vggtjax.options import Options
 
 _SOURCES = tyro.conf.arg(metavar="SOURCE [SOURCE ...]", help_behavior_hint="(required)")
@@ -37,37 +37,11 @@ _SHOTS = (
 )
 _SHARD = "take every N-th clip, from the K-th on: runs for K from 1 to N do the batch together, in one folder"
 
-
-def _result_folder(out: Annotated[Path, tyro.conf.arg(help=_RESULT)]) -> Path:
-    return out
-
-
-def _batch_folder(out: Annotated[str, tyro.conf.arg(help=_BATCH, metavar="FOLDER|URL")]) -> str:
-    return out
-
-
-def _evaluation_folder(out: Annotated[Path, tyro.conf.arg(help=_EVALUATION)]) -> Path:
-    return out
-
-
-def _view(view: Annotated[Switch, tyro.conf.arg(help=_VIEW)] = False) -> bool:
-    return view
-
-
-def _shots(shots: Annotated[Literal["keep", "split"], tyro.conf.arg(help=_SHOTS)] = "keep") -> str:
-    return shots
-
-
-def _shard(shard: Annotated[InWords[str | None], tyro.conf.arg(help=_SHARD, metavar="K/N")] = None) -> str | None:
-    return shard
-
-
-# The name puts a flag into the group of that name.
-ResultFolder = Annotated[Path, tyro.conf.arg(constructor=_result_folder, name="output", prefix_name=False, help="")]
-BatchFolder = Annotated[str, tyro.conf.arg(constructor=_batch_folder, name="output", prefix_name=False, help="")]
-EvaluationFolder = Annotated[
-    Path, tyro.conf.arg(constructor=_evaluation_folder, name="output", prefix_name=False, help="")
+ResultFolder = Annotated[Path, in_group("output", option("out", Path, help=_RESULT))]
+BatchFolder = Annotated[str, in_group("output", option("out", str, help=_BATCH, metavar="FOLDER|URL"))]
+EvaluationFolder = Annotated[Path, in_group("output", option("out", Path, help=_EVALUATION))]
+View = Annotated[bool, in_group("output", option("view", Switch, False, help=_VIEW))]
+Shots = Annotated[str, in_group("input", option("shots", Literal["keep", "split"], "keep", help=_SHOTS))]
+Shards = Annotated[
+    str | None, in_group("output", option("shard", InWords[str | None], None, help=_SHARD, metavar="K/N"))
 ]
-View = Annotated[bool, tyro.conf.arg(constructor=_view, name="output", prefix_name=False, help="")]
-Shots = Annotated[str, tyro.conf.arg(constructor=_shots, name="input", prefix_name=False, help="")]
-Shards = Annotated[str | None, tyro.conf.arg(constructor=_shard, name="output", prefix_name=False, help="")]

@@ -13,12 +13,7 @@ from vggtjax.interface.commands.view import serve
 from vggtjax.options import MethodName, Options
 
 
-def demo(
-    *,
-    out: Path = Path("demo-output"),
-    method: MethodName = "4dvggt-m",
-    view: Switch = False,
-) -> None:
+def demo(*, out: Path = Path("demo-output"), method: MethodName = "4dvggt-m", view: Switch = False) -> None:
     """Reconstruct the embedded clip with the embedded model, and measure the ladder of methods against its truth.
 
     The result's depth and cameras are consistent; the viewer has them as they were predicted, too.
@@ -44,7 +39,7 @@ def demo(
         from vggtjax.pipeline.agreement import agree_with_pixels
         from vggtjax.pipeline.run import reconstruct
         from vggtjax.pipeline.running import Running
-        from vggtjax.results.no_mask import without_mask
+        from vggtjax.results.result import without_mask
 
         running = Running(is_part=True, on_stage=report.stage)
         predicted = reconstruct(model, clip, options=Options(method), running=running, size=size)

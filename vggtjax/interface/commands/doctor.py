@@ -7,7 +7,6 @@ import platform
 import sys
 from collections.abc import Iterator
 from contextlib import suppress
-from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from math import prod
 from typing import Annotated, Any, Literal
@@ -19,7 +18,8 @@ from vggtjax.errors import VggtjaxError, one_line
 from vggtjax.interface.commands.flags import InWords
 from vggtjax.interface.commands.report import Report
 from vggtjax.storage.cache import CONVERTED, cache_folder, cache_parts, clear_cache, size_of
-from vggtjax.storage.free_memory import in_gigabytes
+from vggtjax.storage.host import in_gigabytes
+from vggtjax.storage.versions import installed_version
 
 PACKAGES = ("jax", "jaxlib", "flax", "numpy", "scipy", "pillow", "av", "safetensors", "tyro")
 
@@ -77,7 +77,7 @@ def facts(gpu: str | None = None) -> dict[str, Any]:
     import jax
 
     from vggtjax.storage.backend import backend
-    from vggtjax.storage.free_memory import own_limits, rooms, total_bytes
+    from vggtjax.storage.host import own_limits, rooms, total_bytes
 
     backend()
     devices = []
@@ -91,7 +91,7 @@ def facts(gpu: str | None = None) -> dict[str, Any]:
             "vggtjax": __version__,
             "python": platform.python_version(),
             "system": platform.platform(),
-            **{name: _version(name) for name in PACKAGES},
+            **{name: installed_version(name) for name in PACKAGES},
         },
         "devices": devices,
         "memory": {
@@ -215,10 +215,3 @@ def _longest(clip: dict[str, Any]) -> str:
     if frames is None:
         return "unknown: this system does not tell its memory"
     return f"{frames} frame{'s' if frames > 1 else ''} {size}" if frames else f"no clip {size} fits"
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from inspect import Parameter, Signature
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_type_hints
 
@@ -47,6 +48,22 @@ def _among(group: str, constructor: Any = None) -> Look:
     return lambda hint: Annotated[constructor or hint, tyro.conf.arg(name=group, help="", prefix_name=prefix)]
 
 
+def in_group(group: str, constructor: Callable[..., Any]) -> Any:
+    """Return the annotation of a value that a constructor makes of options, which stand in a group of the help."""
+    return tyro.conf.arg(constructor=constructor, name=group, help="", prefix_name=False)
+
+
+def option(name: str, hint: Any, default: Any = Parameter.empty, **given: Any) -> Callable[..., Any]:
+    """Return a constructor for `in_group` that takes one option, `given` to `tyro.conf.arg`, and returns its value."""
+
+    def value(**values: Any) -> Any:
+        return values[name]
+
+    vars(value)["__signature__"] = Signature([Parameter(name, Parameter.KEYWORD_ONLY, default=default)])
+    value.__annotations__ = {name: Annotated[hint, tyro.conf.arg(**given)]}
+    return value
+
+
 def _refine_mask(refine_mask: Switch = False, no_refine_mask: Switch = False) -> bool | None:
     """Whether the mask is refined; the method's own choice by default.
 
@@ -74,27 +91,6 @@ _MASKS = (
     "them; masks of other clips are mined"
 )
 
-
-def _devices(devices: Annotated[int, tyro.conf.arg(help=_DEVICES, help_behavior_hint="(default: 1)")] = 1) -> int:
-    return devices
-
-
-def _no_memory_check(no_memory_check: Annotated[Switch, tyro.conf.arg(help=_NO_MEMORY_CHECK)] = False) -> bool:
-    return no_memory_check
-
-
-def _undistort(undistort: Annotated[InWords[bool], tyro.conf.arg(help=_UNDISTORT)] = True) -> bool:
-    return undistort
-
-
-def _pad_frames(pad_frames: Annotated[Switch, tyro.conf.arg(help=_PAD_FRAMES)] = False) -> bool:
-    return pad_frames
-
-
-def _masks(masks: Annotated[InWords[Path | None], tyro.conf.arg(help=_MASKS)] = None) -> Path | None:
-    return masks
-
-
 # One argument with commas; tyro's own reading of a tuple would take the words that follow.
 _GROUPS = PrimitiveConstructorSpec(
     nargs=1,
@@ -108,11 +104,11 @@ _DEPTHS = _in_words("FILE|FOLDER|source", aliases=("--depths",))
 _CLIP = {
     "sampling": _among("input"),
     "framing": _among("input"),
-    "undistort": _among("input", _undistort),
+    "undistort": _among("input", option("undistort", InWords[bool], True, help=_UNDISTORT)),
     "options": _among("method"),
-    "devices": _among("limits", _devices),
+    "devices": _among("limits", option("devices", int, 1, help=_DEVICES, help_behavior_hint="(default: 1)")),
     "known": _among("known cameras and scale"),
-    "unchecked": _among("limits", _no_memory_check),
+    "unchecked": _among("limits", option("no_memory_check", Switch, False, help=_NO_MEMORY_CHECK)),
     "saving": _among("output"),
 }
 _FIELDS: dict[type, dict[str, Look]] = {
@@ -133,7 +129,11 @@ _FIELDS: dict[type, dict[str, Look]] = {
     Saving: {"only": lambda hint: InWords[Annotated[hint, _GROUPS]]},
     Cluster: {"address": _in_words("HOST:PORT|auto")},
     ClipRecipe: _CLIP,
-    BatchRecipe: _CLIP | {"pad_frames": _among("limits", _pad_frames), "masks": _among("input", _masks)},
+    BatchRecipe: _CLIP
+    | {
+        "pad_frames": _among("limits", option("pad_frames", Switch, False, help=_PAD_FRAMES)),
+        "masks": _among("input", option("masks", InWords[Path | None], None, help=_MASKS)),
+    },
 }
 
 REGISTRY = ConstructorRegistry()

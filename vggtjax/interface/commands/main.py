@@ -14,7 +14,9 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from itertools import groupby
+from typing import NamedTuple
 
 import tyro
 
@@ -32,16 +34,23 @@ from vggtjax.interface.commands.export import export
 from vggtjax.interface.commands.extend import extend
 from vggtjax.interface.commands.fit_fusion import fit_fusion
 from vggtjax.interface.commands.flags import REGISTRY
-from vggtjax.interface.commands.overview import Command, overview
-from vggtjax.interface.commands.process import check_limits, give_devices_threads
 from vggtjax.interface.commands.reconstruct import reconstruct
 from vggtjax.interface.commands.render import render
 from vggtjax.interface.commands.scenes import scenes
 from vggtjax.interface.commands.train import train
 from vggtjax.interface.commands.view import view
 from vggtjax.storage.cache import enable_compilation_cache
+from vggtjax.storage.host import check_limits, give_devices_threads, keep_freed_memory
 from vggtjax.storage.interruption import message as message_of_interruption
-from vggtjax.storage.malloc import keep_freed_memory
+
+
+class Command(NamedTuple):
+    """A row of the table of commands, whose groups stand together."""
+
+    run: Callable[..., int | None]  # an exit code other than 0; tyro makes its flags and its help
+    group: str  # its title on the page
+    says: str  # its line on the page
+
 
 _START, _RESULTS, _MODELS = "Start", "Look at results, and pass them on", "Models"
 _MEASURE, _COMPUTER = "Measure", "This computer"
@@ -144,6 +153,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         message, code = message_of_interruption(), 130
     sys.stderr.write(f"vggtjax: {message_line(message)}\n")
     return code
+
+
+def overview(commands: Mapping[str, Command]) -> str:
+    """Return the page of `vggtjax --help`: the commands in the order of use, a line each."""
+    width = max(map(len, commands))
+    page = ["usage: vggtjax COMMAND ...", "", "4-D reconstruction of monocular video of a moving world.", ""]
+    for title, rows in groupby(commands.items(), key=lambda row: row[1].group):
+        page += [title, *(f"  {name:<{width}}  {command.says}" for name, command in rows), ""]
+    page += ["vggtjax COMMAND --help tells the options of a command; --version prints the version.", ""]
+    return "\n".join(page)
 
 
 def _with_flag(message: str, arguments: Sequence[str]) -> str:

@@ -54,7 +54,9 @@ def render(
         from vggtjax.results.reconstruction import Reconstruction
         from vggtjax.results.rendering.film import check_film
 
-        film = out or _film_of(result.parent if result.is_file() else result)
+        folder = result.parent if result.is_file() else result
+        previews = folder / "preview"  # which the next result replaces
+        film = out or (previews if previews.is_dir() else folder) / _FILM
         check_film(film, fps)
         check_file(film, overwrite=overwrite or out is None, sources=[result])
         if out is not None:
@@ -69,12 +71,6 @@ def render(
     report.table({"film": film})
     if loaded.model_note:
         report.line(f"The model: {loaded.model_note}")
-
-
-def _film_of(folder: Path) -> Path:
-    """Return where the film of a result goes: beside its previews, which the next result replaces, if it has some."""
-    previews = folder / "preview"
-    return (previews if previews.is_dir() else folder) / _FILM
 
 
 def _sides(size: str) -> tuple[int, int]:

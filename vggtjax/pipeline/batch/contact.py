@@ -139,5 +139,5 @@ def _told(path: Path) -> str:
     pictured = max(float(((box[:, 2] - box[:, 0]) * (box[:, 3] - box[:, 1])).sum()), 1.0)
     size = f"{frames} frame{'' if frames == 1 else 's'} of {width} x {height} pixels"
     method = one_line(str(arrays["method"].item()), 60)
-    makes_none = method in METHODS and not METHODS[method].makes_mask and not mask.any()
+    makes_none = method in METHODS and not METHODS[method].needs_second_pass and not mask.any()
     return f"{size}, {'' if makes_none else f'{mask.sum() / pictured:.1%} moving, '}{method}"

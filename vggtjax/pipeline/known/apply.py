@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections.abc import Callable
-from typing import TypeVar
 
 import numpy as np
 
@@ -17,9 +16,8 @@ from vggtjax.pipeline.known.intrinsics import shared_focal
 from vggtjax.pipeline.known.metric import MetricScale, from_baseline, from_camera_height, from_depths
 from vggtjax.pipeline.known.options import SOURCE
 from vggtjax.pipeline.known.poses import check_agreement
-from vggtjax.results.result import Result
+from vggtjax.results.result import AnyResult, Result
 
-R = TypeVar("R", bound=Result)
 _LARGE_TURN = 15.0  # degrees between predicted and known poses, in the middle
 _LARGE_OFFSET = 0.25  # of the path
 _UNEQUAL = 0.02  # share by which focal lengths across and down a picture have to differ to be told apart
@@ -27,7 +25,9 @@ _UNEQUAL = 0.02  # share by which focal lengths across and down a picture have t
 logger = logging.getLogger(__name__)
 
 
-def apply_known(result: R, given: Given, refine: Callable[[R], R] | None = None) -> tuple[R, float]:
+def apply_known(
+    result: AnyResult, given: Given, refine: Callable[[AnyResult], AnyResult] | None = None
+) -> tuple[AnyResult, float]:
     """Return the result with known intrinsics, poses and scale, and without the depth that is to be left out.
 
     Args:
@@ -63,7 +63,7 @@ def apply_known(result: R, given: Given, refine: Callable[[R], R] | None = None)
     return dataclasses.replace(result, settings=settings), unit
 
 
-def scaled(result: R, factor: float) -> R:
+def scaled(result: AnyResult, factor: float) -> AnyResult:
     """Return the result with depth and camera centres times a factor."""
     poses = result.camera_from_world.astype(np.float64)
     poses[:, :, 3] *= factor
@@ -72,7 +72,7 @@ def scaled(result: R, factor: float) -> R:
     )
 
 
-def _with_intrinsics(result: R, given: Given, notes: dict[str, str]) -> R:
+def _with_intrinsics(result: AnyResult, given: Given, notes: dict[str, str]) -> AnyResult:
     name = "shared focal length" if given.intrinsics is None else "intrinsics"
     intrinsics = shared_focal(result) if given.intrinsics is None else given.intrinsics
     if given.options.intrinsics == SOURCE and given.capture is not None and given.capture.distorted:
@@ -86,7 +86,7 @@ def _with_intrinsics(result: R, given: Given, notes: dict[str, str]) -> R:
     return dataclasses.replace(result, intrinsics=intrinsics.astype(np.float32))
 
 
-def _with_poses(result: R, given: Given, notes: dict[str, str]) -> tuple[R, float]:
+def _with_poses(result: AnyResult, given: Given, notes: dict[str, str]) -> tuple[AnyResult, float]:
     poses = world_from_camera(np.asarray(given.poses)[:, :3])[:, :3]  # the inverse of a rigid transform
     found = check_agreement(result.camera_from_world.astype(np.float64), poses, given.poses_name)
     notes["poses"] = (

@@ -156,9 +156,7 @@ def _below(plane: Float64[np.ndarray, " 4"], cameras: Float64[np.ndarray, "S 3"]
 
 
 def _floor(
-    points: Float64[np.ndarray, "N 3"],
-    cameras: Float64[np.ndarray, "S 3"],
-    down: Float64[np.ndarray, " 3"],
+    points: Float64[np.ndarray, "N 3"], cameras: Float64[np.ndarray, "S 3"], down: Float64[np.ndarray, " 3"]
 ) -> tuple[Float64[np.ndarray, " 4"] | None, float]:
     """Return the plane (normal, offset) below the cameras with the most points, and its share of them."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 
 import numpy as np
@@ -10,15 +9,13 @@ import numpy as np
 from vggtjax.clips.truth import Truth
 from vggtjax.errors import CheckpointError, ClipError
 from vggtjax.network.checkpoint import LoadedDType, Model, read_model
-from vggtjax.storage.writing import writing
 
 MODEL = Path(__file__).with_name("model.safetensors")
 CLIP = MODEL.with_name("clip.npz")
 NOTE = "small demonstration model, trained on generated scenes; not for real footage"
 UNTRAINED_HEADS = ("points", "tracks")
-SCENE_SEED = 100  # of held-out dynamic scenes; the clip is one of them; no evaluation uses this seed
-_NEAREST = np.float32(1e-3)  # metres
-_STEP = 5e-4  # of the logarithm of depth, stored in 16 bits
+NEAREST = np.float32(1e-3)  # metres
+STEP = 5e-4  # of the logarithm of depth, stored in 16 bits
 
 
 def demo_model(dtype: LoadedDType = "float32", compute_dtype: str | None = None) -> Model:
@@ -39,23 +36,7 @@ def demo_clip(path: Path = CLIP) -> Truth:
     if not path.is_file():
         raise ClipError(f"the embedded clip {path} is missing; install vggtjax again")
     with np.load(path, allow_pickle=False) as stored:
-        depth = _NEAREST * np.exp(stored["log_depth"].astype(np.float32) * np.float32(_STEP))
+        depth = NEAREST * np.exp(stored["log_depth"].astype(np.float32) * np.float32(STEP))
         mask = np.unpackbits(stored["dynamic_mask"], count=depth.size).astype(bool).reshape(depth.shape)
         images = stored["images"].astype(np.float32) / 255
         return Truth(images, depth, mask, stored["camera_from_world"], stored["intrinsics"])
-
-
-def write_demo_clip(path: Path, truth: Truth) -> None:
-    """Write a clip for `demo_clip`: colours in 8 bits, depth in 16 bits, the mask in 1 bit."""
-    steps = np.log(np.maximum(truth.depth, _NEAREST) / _NEAREST) / _STEP
-    content = io.BytesIO()
-    np.savez_compressed(
-        content,
-        images=np.rint(255 * truth.images).astype(np.uint8),
-        log_depth=np.rint(np.minimum(steps, 65535)).astype(np.uint16),
-        dynamic_mask=np.packbits(truth.dynamic_mask),
-        camera_from_world=truth.camera_from_world.astype(np.float32),
-        intrinsics=truth.intrinsics.astype(np.float32),
-    )
-    with writing(path) as temporary:
-        temporary.write_bytes(content.getvalue())

@@ -14,7 +14,6 @@ import logging
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import count
-from typing import TypeVar
 
 import numpy as np
 import scipy
@@ -28,10 +27,8 @@ from vggtjax.pipeline.refinement.dense import PREDICTED, ROUNDS, CameraPriors, D
 from vggtjax.pipeline.refinement.field import FieldPrior, Measured, at_pixels, fit_field
 from vggtjax.pipeline.refinement.joining import differences, join_frame, tolerance_of
 from vggtjax.progress import Progress, no_progress
-from vggtjax.results.result import Result
+from vggtjax.results.result import AnyResult, Result
 from vggtjax.storage.arrays import zeros_beside
-
-R = TypeVar("R", bound=Result)
 
 FEWEST_FRAMES, MOST_FRAMES = 3, 512
 _FEWEST_MATCHED = 0.05  # share of the cells whose depth is known from matches
@@ -74,7 +71,7 @@ class ConsistencyReport:
 
 @own_settings()
 def consistent_depth(
-    result: R,
+    result: AnyResult,
     pictures: Iterable[UInt8[np.ndarray, "h w 3"]] | None = None,
     *,
     points: Measured | None = None,
@@ -82,7 +79,7 @@ def consistent_depth(
     field: FieldPrior | None = None,
     join: bool = True,
     progress: Progress | None = None,
-) -> tuple[R, ConsistencyReport]:
+) -> tuple[AnyResult, ConsistencyReport]:
     """Return the result with depth and cameras that agree with its pictures, and a report.
 
     Pixels that move take the field's value and keep their shape. Mask and confidence stay. The cameras change alone
@@ -181,7 +178,9 @@ def _turned(result: Result, world: DenseWorld) -> float:
     return float(np.degrees((after * before.inv()).magnitude().mean()))
 
 
-def _by_field(result: R, world: DenseWorld, fields: np.ndarray, step: Callable[[], None]) -> tuple[R, float]:
+def _by_field(
+    result: AnyResult, world: DenseWorld, fields: np.ndarray, step: Callable[[], None]
+) -> tuple[AnyResult, float]:
     """Return the result with the world's cameras and depth times the fields' scales, and the mean |log| of these."""
     size, depth, change = result.depth.shape[1:], zeros_beside(result.depth, np.float32), []
     for frame, field in enumerate(fields):
@@ -194,7 +193,7 @@ def _by_field(result: R, world: DenseWorld, fields: np.ndarray, step: Callable[[
     return made, float(np.mean(change))
 
 
-def _joined(result: R, tolerance: float, step: Callable[[], None]) -> tuple[R, float]:
+def _joined(result: AnyResult, tolerance: float, step: Callable[[], None]) -> tuple[AnyResult, float]:
     """Return the result with the mean depth of the frames that see a surface, and the share of static pixels joined."""
     depth, joined = zeros_beside(result.depth, np.float32), 0
     for frame in range(len(depth)):
@@ -206,13 +205,13 @@ def _joined(result: R, tolerance: float, step: Callable[[], None]) -> tuple[R, f
     return dataclasses.replace(result, depth=depth), joined / max(static, 1)
 
 
-def _kept(result: R, reason: str, warns: bool = True) -> tuple[R, ConsistencyReport]:
+def _kept(result: AnyResult, reason: str, warns: bool = True) -> tuple[AnyResult, ConsistencyReport]:
     """Return the result as it is. Clips of one or two frames are kept without a warning: nothing else is expected."""
     report = ConsistencyReport(False, reason)
     logger.log(logging.WARNING if warns else logging.INFO, "%s", report.sentence)
     return _reported(result, report)
 
 
-def _reported(result: R, report: ConsistencyReport) -> tuple[R, ConsistencyReport]:
+def _reported(result: AnyResult, report: ConsistencyReport) -> tuple[AnyResult, ConsistencyReport]:
     outcome = {"sentence": report.sentence, **dataclasses.asdict(report)}
     return dataclasses.replace(result, settings=result.settings | {"consistency": outcome}), report

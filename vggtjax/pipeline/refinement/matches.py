@@ -26,7 +26,7 @@ _GROWN = 64  # the masks grow by 1 / 64 of the frame's width
 Pair = tuple[int, int]
 
 
-class Features(NamedTuple):
+class PictureFeatures(NamedTuple):
     """Features of a picture."""
 
     positions: Float64[np.ndarray, "N 2"]  # x, y in pixels of the source; edges at whole numbers
@@ -49,7 +49,7 @@ def frame_pairs(frames: int) -> list[Pair]:
 
 def find_features(
     result: Result, pictures: Iterable[UInt8[np.ndarray, "h w 3"]], on_step: Callable[[], object]
-) -> list[Features]:
+) -> list[PictureFeatures]:
     """Return the features of each picture that lie on pixels which the model saw and which do not move.
 
     Raises ClipError for a missing picture, or one of another size than the result's.
@@ -61,7 +61,7 @@ def find_features(
     options.sift.peak_threshold = _PEAK
     extractor = pycolmap.FeatureExtractor.create(options, device=pycolmap.Device.cpu)
     static = _static_pixels(result)
-    features: list[Features] = []
+    features: list[PictureFeatures] = []
     for frame, picture in enumerate(pictures):
         if frame == len(static):
             break
@@ -75,14 +75,14 @@ def find_features(
         kept = np.flatnonzero(_falls_on(static[frame], result, frame, positions) & _first_of_place(positions))
         described = descriptors.data.reshape(-1, 128)[kept].astype(np.float32)
         described /= np.maximum(np.linalg.norm(described, axis=1, keepdims=True), 1)
-        features.append(Features(positions[kept], described))
+        features.append(PictureFeatures(positions[kept], described))
         on_step()
     check_number(result, len(features))
     return features
 
 
 def match_pairs(
-    features: Sequence[Features], pairs: Sequence[Pair], unit: float, on_step: Callable[[], object]
+    features: Sequence[PictureFeatures], pairs: Sequence[Pair], unit: float, on_step: Callable[[], object]
 ) -> dict[Pair, Int64[np.ndarray, "K 2"]]:
     """Return the matches of the pairs that have at least 15 on one epipolar geometry, as indices of their features.
 

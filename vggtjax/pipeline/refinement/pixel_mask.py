@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable
-from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -19,9 +18,7 @@ from vggtjax.network.surroundings import own_settings
 from vggtjax.pipeline.refinement.cells import Cells, at_scale, cells_of, grey_pictures
 from vggtjax.pipeline.refinement.consistent import FEWEST_FRAMES, MOST_FRAMES
 from vggtjax.pipeline.refinement.pixel_matches import PixelMatches, Window, expected_matches, match_pixels
-from vggtjax.results.result import Result
-
-R = TypeVar("R", bound=Result)
+from vggtjax.results.result import AnyResult
 
 _mask = jax.jit(is_moving)
 
@@ -36,7 +33,7 @@ _OFFSET, _FLOOR = 0.25, 0.1  # score = log(difference + offset) + log(Gram + flo
 
 
 @own_settings()
-def mask_by_pixels(result: R, pictures: Iterable[UInt8[np.ndarray, "h w 3"]] | None = None) -> R:
+def mask_by_pixels(result: AnyResult, pictures: Iterable[UInt8[np.ndarray, "h w 3"]] | None = None) -> AnyResult:
     """Return the result with the motion and the dynamic mask that its pixels tell, around its cameras and depth.
 
     Stays as it is: a clip of fewer than three frames or more than 512, or of equal frames, or whose mask was not mined

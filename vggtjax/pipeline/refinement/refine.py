@@ -7,7 +7,7 @@ import logging
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import count
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
@@ -21,9 +21,8 @@ from vggtjax.pipeline.refinement.matches import find_features, frame_pairs, matc
 from vggtjax.pipeline.refinement.points import measured_at_points
 from vggtjax.pipeline.refinement.tracks import Tracks, dense_depth_at, join_matches, starting_points
 from vggtjax.progress import Progress, no_progress
-from vggtjax.results.result import Result
+from vggtjax.results.result import AnyResult, Result
 
-R = TypeVar("R", bound=Result)
 _SCHEDULES = ((1, 1), (4, 2, 1, 1))
 """Scales of the loss in working pixels, for adjustments that start at the network's cameras."""
 _AFTER_MAPPING = (4, 2, 1, 1)
@@ -59,10 +58,10 @@ class RefinementReport:
         )
 
 
-class Refined(NamedTuple, Generic[R]):
+class Refined(NamedTuple, Generic[AnyResult]):
     """A result whose cameras were refined, or kept."""
 
-    result: R
+    result: AnyResult
     report: RefinementReport
     points: Measured | None  # the depths of its points over the result's; None where the cameras were kept
 
@@ -76,12 +75,12 @@ def check_refinement(wanted: bool, known_poses: bool = False) -> None:
 
 
 def refine_cameras(
-    result: R,
+    result: AnyResult,
     pictures: Iterable[UInt8[np.ndarray, "h w 3"]],
     *,
     fixed_intrinsics: bool = False,
     progress: Progress | None = None,
-) -> tuple[R, RefinementReport]:
+) -> tuple[AnyResult, RefinementReport]:
     """Return the result with cameras that agree with matches between its pictures, and a report.
 
     `refine_with_points` says more, and returns the depths of the matched points too.
@@ -98,12 +97,12 @@ def warn_of_kept(report: RefinementReport) -> None:
 
 
 def refine_with_points(
-    result: R,
+    result: AnyResult,
     pictures: Iterable[UInt8[np.ndarray, "h w 3"]],
     *,
     fixed_intrinsics: bool = False,
     progress: Progress | None = None,
-) -> Refined[R]:
+) -> Refined[AnyResult]:
     """Return the result with cameras that agree with matches between its pictures, a report, and the points' depths.
 
     SIFT features on static pixels are matched between frames; their tracks start where the dense depth puts them. A
@@ -146,14 +145,14 @@ def refine_with_points(
 
 
 def adjust_to_tracks(
-    result: R,
+    result: AnyResult,
     tracks: Tracks,
     *,
     matched: Matched | None = None,
     unit: float = 1.0,
     fixed_intrinsics: bool = False,
     on_round: Callable[[], object] = lambda: None,
-) -> Refined[R]:
+) -> Refined[AnyResult]:
     """Return what `refine_with_points` does, for given tracks.
 
     Args:
@@ -197,11 +196,7 @@ def adjust_to_tracks(
     K = result.intrinsics.astype(np.float64)
     focal = [0, 1]
     K[:, focal, focal] = adjusted.cameras.intrinsics[:, focal, focal] / result.source_scale
-    refined = dataclasses.replace(
-        result,
-        camera_from_world=poses.astype(np.float32),
-        intrinsics=K.astype(np.float32),
-    )
+    refined = dataclasses.replace(result, camera_from_world=poses.astype(np.float32), intrinsics=K.astype(np.float32))
     points = measured_at_points(adjusted, tracks, result, scale)
     return _reported(refined, RefinementReport(True, **numbers), points)
 
@@ -247,7 +242,7 @@ def _best(
     return best
 
 
-def _reported(result: R, report: RefinementReport, points: Measured | None = None) -> Refined[R]:
+def _reported(result: AnyResult, report: RefinementReport, points: Measured | None = None) -> Refined[AnyResult]:
     settings = result.settings | {"refined_cameras": {"sentence": report.sentence, **dataclasses.asdict(report)}}
     return Refined(dataclasses.replace(result, settings=settings), report, points)
 

@@ -18,7 +18,7 @@ from vggtjax.cameras import Similarity, align, checked_centres
 from vggtjax.results.result import Result, inside_box, show_points
 
 
-class View(NamedTuple):
+class WindowView(NamedTuple):
     """What a window says of a frame."""
 
     result: Result
@@ -39,7 +39,7 @@ class BlendedFrame(NamedTuple):
     intrinsics: Float64[np.ndarray, "3 3"]
 
 
-def blend_frame(views: Sequence[View]) -> BlendedFrame:
+def blend_frame(views: Sequence[WindowView]) -> BlendedFrame:
     """Return a frame that one or more windows have seen."""
     weights = np.array([view.weight for view in views])
     depths = np.stack([view.similarity.scale * view.result.depth[view.number].astype(np.float64) for view in views])
@@ -71,7 +71,7 @@ def blend_frame(views: Sequence[View]) -> BlendedFrame:
     )
 
 
-def blend_cameras(views: Sequence[View]) -> Float64[np.ndarray, "3 4"]:
+def blend_cameras(views: Sequence[WindowView]) -> Float64[np.ndarray, "3 4"]:
     """Return the camera of a frame in the world of the whole clip."""
     poses = np.concatenate([align(view.result.camera_from_world[view.number][None], view.similarity) for view in views])
     weights = np.array([view.weight for view in views])

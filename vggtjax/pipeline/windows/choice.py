@@ -15,7 +15,7 @@ from vggtjax.network.checkpoint import Model
 from vggtjax.pipeline import memory
 from vggtjax.pipeline.windows.frames import count_frames
 from vggtjax.pipeline.windows.plan import Windows
-from vggtjax.storage.free_memory import in_gigabytes
+from vggtjax.storage.host import in_gigabytes
 
 _LENGTHS = (64, 48, 32, 24, 16, 12, 8)  # frames of a window, the longest that fits
 
@@ -27,7 +27,7 @@ class Planned(NamedTuple):
     parameter_bytes: int
 
 
-class Choice(NamedTuple):
+class WindowsChoice(NamedTuple):
     """A clip that does not fit as a whole, and what is done about it."""
 
     windows: Windows  # the longest that fit; the shortest where none does
@@ -80,7 +80,7 @@ def choose_windows(
     method: str = "4dvggt-d",
     clips: int = 1,
     devices: int = 1,
-) -> Choice | None:
+) -> WindowsChoice | None:
     """Return windows for a clip that does not fit in memory; None for one that does, or where memory is not known.
 
     The frames of a video are decoded to be counted, but no more of them than fit.
@@ -110,7 +110,7 @@ def choose_windows(
     need = partial(memory.predicted_bytes, **how)
     needed = need(model, frames, height, width)
     smaller = _smaller(model, (frames, height, width), fitter, room.size, most, need)
-    return Choice(windows, frames, needed, room.size, room.limit, smaller, room.is_hard)
+    return WindowsChoice(windows, frames, needed, room.size, room.limit, smaller, room.is_hard)
 
 
 def smaller_window(frames: int) -> Windows | None:

@@ -82,10 +82,7 @@ def clip_of(frames: Sequence[tuple[Result, int]], like: Clip) -> Clip:
         images=stacked("images") / np.float32(255),
         frame_names=[result.frame_names[number] for result, number in frames],
         timestamps=stacked("timestamps") if timed else None,
-        source_size=stacked("source_size"),
-        source_scale=stacked("source_scale"),
-        source_offset=stacked("source_offset"),
-        valid_box=stacked("valid_box"),
+        **{name: stacked(name) for name in _PLACES},
     )
 
 

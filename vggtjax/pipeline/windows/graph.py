@@ -121,10 +121,7 @@ def _exponential(steps: Float64[np.ndarray, "N 7"], unit: Float64[np.ndarray, "N
 
 
 def _least_squares(
-    count: int,
-    ends: Int[np.ndarray, "E 2"],
-    slopes: Float64[np.ndarray, "E 7 14"],
-    error: Float64[np.ndarray, "E 7"],
+    count: int, ends: Int[np.ndarray, "E 2"], slopes: Float64[np.ndarray, "E 7 14"], error: Float64[np.ndarray, "E 7"]
 ) -> Float64[np.ndarray, "N 7"]:
     """Return the steps of all windows that take the errors away as well as can be; window 0 stays."""
     rows = np.arange(error.size).reshape(-1, _FREEDOM, 1)

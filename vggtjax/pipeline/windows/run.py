@@ -46,14 +46,14 @@ from vggtjax.pipeline.windows.join import JoinRule
 from vggtjax.pipeline.windows.overlap import thinned
 from vggtjax.pipeline.windows.plan import Windows, plan_windows
 from vggtjax.pipeline.windows.store import FOLDER, WindowStore, write_cut
-from vggtjax.pipeline.windows.tracks import Follow, Images, Start, Tracked
+from vggtjax.pipeline.windows.tracks import Follow, Images, Tracked, TrackStart
 from vggtjax.pipeline.windows.whole import Whole, store_window
-from vggtjax.progress import OnStage, Progress, StageSeconds, no_stage
+from vggtjax.progress import OnStage, Progress, StageSeconds, no_progress, no_stage
 from vggtjax.results.disk import announce, forecast_bytes
 from vggtjax.results.folder import check_folder
-from vggtjax.results.no_mask import without_mask
 from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.report import RunFacts, versions
+from vggtjax.results.result import without_mask
 from vggtjax.results.saving import Saving
 from vggtjax.storage.interruption import kept
 from vggtjax.storage.writing import locked_folder
@@ -183,7 +183,7 @@ def tools_of(
         height, width = (side // config.patch_size for side in images.shape[1:3])
         return thinned(tokens(images), (height, width))
 
-    def follow(images: Images, starts: Sequence[Start]) -> list[Tracked]:
+    def follow(images: Images, starts: Sequence[TrackStart]) -> list[Tracked]:
         frames = jax.device_put(images[None])
         clips, found = ClipBatch(frames, features(frames)), []
         for frame, places in starts:
@@ -262,8 +262,7 @@ def run_windows(
             for number, clip in enumerate(chain([first], clips)):
                 seen.add(clip, cut[number])
                 store_window(number, clip, cut[number], store, tools.run, tools.describe)
-                if progress is not None:
-                    progress(number + 1, len(cut))
+                (progress or no_progress)(number + 1, len(cut))
         tracks = {}
         if plan.tracks is not None:
             assert tools.follow is not None

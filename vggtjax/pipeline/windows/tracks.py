@@ -32,14 +32,14 @@ Images = Float32[np.ndarray, "F H W 3"]
 Places = Float32[np.ndarray, "Q 2"]
 
 
-class Start(NamedTuple):
+class TrackStart(NamedTuple):
     """Points that the tracker follows together, from one frame of a window."""
 
     frame: int
     places: Places
 
 
-Follow = Callable[[Images, Sequence[Start]], Sequence[Tracked]]
+Follow = Callable[[Images, Sequence[TrackStart]], Sequence[Tracked]]
 
 
 class _Neighbour(NamedTuple):
@@ -124,7 +124,7 @@ def _in_window(
     window: range,
     own: Int64[np.ndarray, " O"],
     neighbour: _Neighbour | None,
-    follow: Callable[[Sequence[Start]], Sequence[Tracked]],
+    follow: Callable[[Sequence[TrackStart]], Sequence[Tracked]],
 ) -> Tracked:
     """Follow the points of a neighbour and a window's own ones through the window.
 
@@ -132,19 +132,19 @@ def _in_window(
     are followed from each frame in which some are taken over, so that the tracker is compiled once, and each is kept
     of its own frame.
     """
-    starts: list[Start] = []
+    starts: list[TrackStart] = []
     kept: list[tuple[np.ndarray, np.ndarray]] = []  # of each start: columns of the outputs, and where they go
     taken = 0
     if neighbour is not None:
         taken = len(neighbour.points)
         frames = _takeovers(neighbour, shared_frames(neighbour.window, window))
         for frame in np.unique(frames).tolist():
-            starts.append(Start(frame - window.start, neighbour.tracked.positions[frame - neighbour.window.start]))
+            starts.append(TrackStart(frame - window.start, neighbour.tracked.positions[frame - neighbour.window.start]))
             here = np.flatnonzero(frames == frame)
             kept.append((here, here))
     for frame in np.unique(queries.frames[own]).tolist():
         here = np.flatnonzero(queries.frames[own] == frame)
-        starts.append(Start(frame - window.start, queries.points[own[here]]))
+        starts.append(TrackStart(frame - window.start, queries.points[own[here]]))
         kept.append((np.arange(len(here)), taken + here))
     count = taken + len(own)
     shapes = ((len(window), count, 2), (len(window), count), (len(window), count))

@@ -18,7 +18,7 @@ from jaxtyping import Float32
 from vggtjax.cameras import Similarity
 from vggtjax.clips.clip import Clip
 from vggtjax.clips.queries import Queries
-from vggtjax.pipeline.windows.blend import View, blend_frame
+from vggtjax.pipeline.windows.blend import WindowView, blend_frame
 from vggtjax.pipeline.windows.frames import clip_of
 from vggtjax.pipeline.windows.graph import LEAST_RESIDUAL, Edge, edge_of, solve_graph
 from vggtjax.pipeline.windows.join import Join, JoinRule, join_windows, reach_of
@@ -122,8 +122,7 @@ class Whole:
                         )  # fmt: skip
                     self.joins.append(join)
                 last = here
-                if progress is not None:
-                    progress(number + 1, len(self.windows))
+                (progress or no_progress)(number + 1, len(self.windows))
         usual = self._usual()
         for number, join in enumerate(self.joins):
             edges.append(edge_of(number, number + 1, join.similarity, join.residual, usual))
@@ -142,8 +141,7 @@ class Whole:
             for number, loop in enumerate(found):
                 edge = self._verified(loop, like)
                 edges += [] if edge is None else [edge]
-                if progress is not None:
-                    progress(number + 1, len(found))
+                (progress or no_progress)(number + 1, len(found))
         return edges
 
     def _verified(self, loop: Loop, like: Clip) -> Edge | None:
@@ -195,7 +193,7 @@ class Whole:
                 weights = blend_weights(frame, self.windows)
                 held = {n: held[n] if n in held else self.store.load(window_name(n)) for n in weights}
                 masked_by |= {n: str(window.settings.get("masks")) for n, window in held.items()}
-                views = [View(held[n], frame - self.windows[n].start, worlds[n], w) for n, w in weights.items()]
+                views = [WindowView(held[n], frame - self.windows[n].start, worlds[n], w) for n, w in weights.items()]
                 blended = blend_frame(views)
                 for name in _BLENDED:
                     if name in arrays:
@@ -207,8 +205,7 @@ class Whole:
                     if name in arrays:
                         arrays[name][frame] = getattr(source, name)[number]
                 names.append(source.frame_names[number])
-                if progress is not None:
-                    progress(frame + 1, total)
+                (progress or no_progress)(frame + 1, total)
         if not is_matched:
             arrays.pop("motion", None)
         fields: dict[str, Any] = {"saliency": None, "timestamps": None, **arrays, **tracks}

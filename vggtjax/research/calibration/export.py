@@ -65,7 +65,12 @@ def save_calibration(
     choice = choice._replace(motion=config.motion)
     numbers = calibration_numbers(model, sweep, choice, auc) | {"source": dict(source or {})}
     if second is not None:
-        numbers["second_pass"] = _second_pass(second)
+        numbers["second_pass"] = {
+            "recommended": second.best._asdict(),
+            "scenes": second.scenes,
+            "first_pass": second.first._asdict(),
+            "errors": [setting._asdict() | error._asdict() for setting, error in second.errors.items()],
+        }
     with staging(folder) as staged:
         names = {"name": model.name or None, "note": model.note}
         save_model(staged / MODEL, model.params, config, **names, untrained_heads=model.untrained_heads)
@@ -112,12 +117,6 @@ def calibration_numbers(
             for c, kind in enumerate(KINDS)
         ],
     }
-
-
-def _second_pass(second: SecondPassChoice) -> dict[str, Any]:
-    errors = [setting._asdict() | error._asdict() for setting, error in second.errors.items()]
-    numbers = {"recommended": second.best._asdict(), "scenes": second.scenes}
-    return numbers | {"first_pass": second.first._asdict(), "errors": errors}
 
 
 def _step(step: Step) -> dict[str, Any]:

@@ -338,8 +338,10 @@ def _row(
     def all_cameras() -> Similarity:
         return umeyama_sim3(checked_centres(camera_from_world), checked_centres(truth.camera_from_world))
 
-    def first_camera() -> Similarity:
-        return _first_to_first(camera_from_world[0], truth.camera_from_world[0], median_scale(depth, truth.depth))
+    def first_camera() -> Similarity:  # brings it to the true one, with points scaled as seen from it
+        scale, pose, true_pose = median_scale(depth, truth.depth), camera_from_world[0], truth.camera_from_world[0]
+        to_camera = Similarity(scale, pose[:, :3], scale * pose[:, 3])
+        return Similarity(1, true_pose[:, :3], true_pose[:, 3]).inverse().after(to_camera)
 
     distance = float(np.median(truth.depth[known])) if known.any() else None
     return LadderRow(
@@ -370,9 +372,3 @@ def _depth_scores(depth: Float[np.ndarray, "S H W"], truth: Truth) -> dict[str, 
 
     values = (whole.abs_rel, within(~truth.dynamic_mask), within(truth.dynamic_mask), whole.delta1)
     return dict(zip(_DEPTH_SCORES, values, strict=True))
-
-
-def _first_to_first(pose: Float[np.ndarray, "3 4"], true_pose: Float[np.ndarray, "3 4"], scale: float) -> Similarity:
-    """Return the similarity that brings a camera to the true one, with points scaled as seen from it."""
-    to_camera = Similarity(scale, pose[:, :3], scale * pose[:, 3])
-    return Similarity(1, true_pose[:, :3], true_pose[:, 3]).inverse().after(to_camera)

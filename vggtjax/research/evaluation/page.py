@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -66,12 +67,7 @@ def write_report(
     means = summary(records)
     values = {
         "settings": dict(settings),
-        "sequences": [
-            {"name": r.name, "method": r.method, "status": r.status, "reason": r.reason, "frames": r.frames}
-            | {"metrics": r.metrics, "notes": list(r.notes), "left_out": r.left_out, "seconds": r.seconds}
-            | {"settings": r.settings}
-            for r in records
-        ],
+        "sequences": [asdict(record) for record in records],
         "mean": means,
         "seconds": costs(records),
     }

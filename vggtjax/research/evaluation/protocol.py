@@ -38,13 +38,7 @@ class Scores(NamedTuple):
     curves: dict[str, np.ndarray]  # for the plots
 
 
-def score(
-    result: Result,
-    truth: TruthAtPixels,
-    *,
-    depth_align: Align = "scale",
-    empty: Empty = "davis",
-) -> Scores:
+def score(result: Result, truth: TruthAtPixels, *, depth_align: Align = "scale", empty: Empty = "davis") -> Scores:
     """Score a result by each protocol of docs/reference/evaluation-protocols.md that the sequence has ground truth for.
 
     Args:

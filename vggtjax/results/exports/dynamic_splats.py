@@ -74,8 +74,7 @@ def write_dynamic_splats(
     for split, names in (("train", trained), ("val", tested)):
         numbers = [ids.index(name) for name in names]
         _dump(
-            folder / f"splits/{split}.json",
-            {"frame_names": names, "camera_ids": [0] * len(names), "time_ids": numbers},
+            folder / f"splits/{split}.json", {"frame_names": names, "camera_ids": [0] * len(names), "time_ids": numbers}
         )
     count = {"count": len(ids), "num_exemplars": len(trained)}
     _dump(folder / "dataset.json", count | {"ids": ids, "train_ids": trained, "val_ids": tested})

@@ -15,8 +15,9 @@ from vggtjax.progress import Progress, no_progress
 from vggtjax.results.exports.names import picture_names, safe_names, say_renamed
 from vggtjax.results.exports.table import FORMATS, ExportFormat, Exporting
 from vggtjax.results.exports.views import View, views
+from vggtjax.results.point_cloud import PointCloud
 from vggtjax.results.result import Result
-from vggtjax.results.shown import POINT_LIMIT, ShownPoints, shown_points
+from vggtjax.results.shown import POINT_LIMIT, shown_points
 from vggtjax.storage.trajectories import write_trajectory
 from vggtjax.storage.writing import writing
 
@@ -94,34 +95,28 @@ def _write(
             from vggtjax.results.exports.colmap import write_colmap
 
             static = _static(result, form, exporting)
-            write_colmap(path, items, result, static.cloud(result), "text" if form == "colmap-text" else "binary")
+            write_colmap(path, items, result, static, "text" if form == "colmap-text" else "binary")
         case "nerfstudio":
             from vggtjax.results.exports.nerfstudio import write_nerfstudio
 
-            static = _static(result, form, exporting)
-            write_nerfstudio(path, items, static.cloud(result))
+            write_nerfstudio(path, items, _static(result, form, exporting))
         case "rerun":
             from vggtjax.results.exports.rerun import write_rerun
 
-            static, moving = _shown(result, exporting)
-            write_rerun(path, items, static.cloud(result), [points.cloud(result) for points in moving])
+            write_rerun(path, items, *_clouds(result, exporting))
         case "glb-animated":
             from vggtjax.results.exports.animated_glb import write_animated_glb
 
             most_moving = min(exporting.points, POINT_LIMIT // len(result.depth))
-            static, moving = _shown(result, exporting, most_moving)
-            write_animated_glb(path, result, static.cloud(result), [points.cloud(result) for points in moving])
+            write_animated_glb(path, result, *_clouds(result, exporting, most_moving))
         case "dynamic-splats":
             from vggtjax.results.exports.dynamic_splats import write_dynamic_splats
 
-            static, moving = _shown(result, exporting)
-            clouds = [points.cloud(result) for points in moving]
-            write_dynamic_splats(path, items, result, static.cloud(result), clouds)
+            write_dynamic_splats(path, items, result, *_clouds(result, exporting))
         case "blender":
             from vggtjax.results.exports.blender import write_blender
 
-            static, moving = _shown(result, exporting)
-            write_blender(path, items, result, static.cloud(result), [points.cloud(result) for points in moving])
+            write_blender(path, items, result, *_clouds(result, exporting))
         case "mesh":
             from vggtjax.results.exports.mesh import write_mesh
 
@@ -137,9 +132,10 @@ def _write(
             np.savetxt(path, poses, fmt="%.9g", encoding="utf-8")
 
 
-def _shown(
+def _clouds(
     result: Result, exporting: Exporting, most_moving: int | None = None
-) -> tuple[ShownPoints, list[ShownPoints]]:
+) -> tuple[PointCloud, list[PointCloud]]:
+    """Return the static points, and the moving ones of each frame. Raises InputError where there is no point."""
     percentile = exporting.confidence_percentile
     static, moving = shown_points(
         result,
@@ -151,13 +147,13 @@ def _shown(
     if not len(static.positions) + sum(len(points.positions) for points in moving):
         seen = "is sure of its depth and off the edges of surfaces" if (result.depth > 0).any() else "has a depth"
         raise InputError(f"the result has no point: no pixel {seen}; run again, and look at its report.html first")
-    return static, moving
+    return static.cloud(result), [points.cloud(result) for points in moving]
 
 
-def _static(result: Result, form: ExportFormat, exporting: Exporting) -> ShownPoints:
+def _static(result: Result, form: ExportFormat, exporting: Exporting) -> PointCloud:
     """Return the static points. Raises InputError without any: no program could use such a model."""
-    static, _ = _shown(result, exporting)
-    if not len(static.positions):
+    static, _ = _clouds(result, exporting)
+    if not len(static):
         why = (
             f"{result.dynamic_share:.0%} of its pixels move; are the masks the wrong way round (white is what moves)?"
             if result.has_mask and result.dynamic_share > _MOSTLY

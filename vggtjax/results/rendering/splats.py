@@ -125,7 +125,8 @@ def _spread_discs(centres: Int32[np.ndarray, "H W"], radius: int, ranks: Int32[n
     height, width = centres.shape
     runs, reached = centres.copy(), 0
     for down in range(radius, -1, -1):  # the runs grow towards the middle of the disc
-        for shift in range(reached + 1, half_run(radius, down) + 1):
+        half_run = int(np.sqrt((radius + 0.5) ** 2 - down**2))  # pixels right of the middle column in this row
+        for shift in range(reached + 1, half_run + 1):
             if shift < width:
                 np.maximum(runs[:, shift:], centres[:, :-shift], out=runs[:, shift:])
                 np.maximum(runs[:, :-shift], centres[:, shift:], out=runs[:, :-shift])
@@ -135,8 +136,3 @@ def _spread_discs(centres: Int32[np.ndarray, "H W"], radius: int, ranks: Int32[n
         elif down < height:
             np.maximum(ranks[down:], runs[:-down], out=ranks[down:])
             np.maximum(ranks[:-down], runs[down:], out=ranks[:-down])
-
-
-def half_run(radius: int, down: int) -> int:
-    """Return how many pixels right of the middle column a disc reaches, `down` rows off its middle row."""
-    return int(np.sqrt((radius + 0.5) ** 2 - down**2))

@@ -143,10 +143,6 @@ def _ends(low: str, high: str) -> Callable[[Result], dict[str, Any]]:
     return lambda _: {"low": low, "high": high}
 
 
-def _has_mask(result: Result) -> bool:
-    return not lacks(result, "dynamic_mask")
-
-
 TIME_RAMP = color_ramp("plasma")
 _MODES = (
     ColorMode("depth", lambda _: True, _depth, DEPTH_COLORS, _ends("far", "near")),
@@ -166,14 +162,14 @@ _MODES = (
     ),
     ColorMode(
         "mask",
-        _has_mask,
+        lambda result: result.has_mask,
         lambda result, points: points.values(result.dynamic_mask).astype(np.uint8),
         _palette(_GREY, (255, 90, 130)),
         lambda _: {"names": [(_STATIC, "static"), (_MOVING, "moving")]},
     ),
     ColorMode(
         "object",
-        lambda result: _has_mask(result) and bool(result.instances.any()),
+        lambda result: result.has_mask and bool(result.instances.any()),
         lambda result, points: moving_ids(points.values(result.dynamic_mask), points.values(result.instances)),
         np.concatenate([np.array([_GREY], np.uint8), INSTANCE_COLORS[1:]]),
         _object_names,

@@ -158,11 +158,7 @@ def _steps(result: Result, points: ShownPoints) -> UInt8[np.ndarray, " N"]:
 def _cameras(result: Result, place: Place) -> dict[str, Any]:
     """Return world-from-camera in the page's world, and the tangents of half the fields of view."""
     poses = np.concatenate(
-        [
-            place.rotation @ result.world_from_camera[:, :3, :3],
-            place.points(result.camera_centres)[..., None],
-        ],
-        axis=-1,
+        [place.rotation @ result.world_from_camera[:, :3, :3], place.points(result.camera_centres)[..., None]], axis=-1
     )
     return {"poses": poses.astype(np.float32).ravel(), "tangents": tangents(result).astype(np.float32).ravel()}
 

@@ -13,4 +13,3 @@ from .sampling import sample_scene as sample_scene
 from .scene import Scene as Scene
 from .textures import Textures as Textures
 from .textures import load_textures as load_textures
-from .walks import closed_walk as closed_walk

@@ -48,12 +48,7 @@ class Hardness(NamedTuple):
 
 
 def held_out_scenes(
-    kind: Kind,
-    count: int = 64,
-    config: SceneConfig | None = None,
-    *,
-    seed: int = 0,
-    progress: Progress | None = None,
+    kind: Kind, count: int = 64, config: SceneConfig | None = None, *, seed: int = 0, progress: Progress | None = None
 ) -> SyntheticClip:
     """Return the test scenes of a seed, with a leading axis of `count`, as numpy arrays.
 

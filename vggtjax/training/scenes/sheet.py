@@ -33,11 +33,6 @@ def draw_sheet(scenes: Sequence[Path], title: str) -> Image.Image:
     return Image.fromarray(draw_grid(title, _COLUMNS, rows, size))
 
 
-def color_parts(part_ids: UInt8[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
-    """Colour every part by its number, alike in all pictures; the room is grey."""
-    return np.where(part_ids[..., None] > 0, INSTANCE_COLORS[part_ids], _REST)
-
-
 def color_flow(flow: Float[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
     """Colour flow along x, y, z as red, green, blue around mid grey; the fastest has full colour, rest is dark."""
     fastest = np.abs(flow).max()
@@ -52,12 +47,12 @@ def _row(scene: Path) -> list[np.ndarray]:
     images = [_pixels(scene / f"images/{name}.png") for name in (names[0], middle, names[-1])]
     depth = np.load(scene / f"depth/{middle}.npy", allow_pickle=False)
     valid = np.ones(depth.shape, bool)
-    mask = _pixels(scene / f"mask/{middle}.png") > 0
+    mask, parts = _pixels(scene / f"mask/{middle}.png") > 0, _pixels(scene / f"parts/{middle}.png")
     return [
         *images,
         color_depth(depth, valid, inverse_depth_range(depth[None], valid[None])),
         overlay(images[1], mask),
-        color_parts(_pixels(scene / f"parts/{middle}.png")),
+        np.where(parts[..., None] > 0, INSTANCE_COLORS[parts], _REST),  # alike in all pictures; the room is grey
         color_flow(np.load(scene / f"flow/{middle}.npy", allow_pickle=False)),
     ]
 
