@@ -40,10 +40,9 @@ from vggtjax.pipeline.windows.run import Tools, tools_of
 from vggtjax.pipeline.windows.store import FOLDER, WindowStore
 from vggtjax.pipeline.windows.whole import window_name
 from vggtjax.progress import OnStage, Progress, no_stage
-from vggtjax.results.no_mask import without_mask
 from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.report import versions
-from vggtjax.results.result import ARRAYS, TRACKS, missing_fields, show_points
+from vggtjax.results.result import ARRAYS, TRACKS, missing_fields, show_points, without_mask
 from vggtjax.storage.interruption import kept
 from vggtjax.storage.writing import locked_folder, write_errors
 
