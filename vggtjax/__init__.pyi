@@ -18,6 +18,7 @@ from .pipeline.batch.many import reconstruct_many as reconstruct_many
 from .pipeline.infer import infer as infer
 from .pipeline.pretrained.load import load_model as load_model
 from .pipeline.run import reconstruct as reconstruct
+from .pipeline.windows.extend import extend as extend
 from .pipeline.windows.plan import Windows as Windows
 from .pipeline.windows.run import reconstruct_long as reconstruct_long
 from .results.reconstruction import Reconstruction as Reconstruction

@@ -46,6 +46,7 @@ class Clip(NamedTuple):
 def make(folder: Path = FOLDER) -> None:
     """Make all pictures in `folder`, unless those there are of this code, model and clip."""
     import consistency
+    import extension
     import matplotlib
 
     import vggtjax
@@ -69,6 +70,7 @@ def make(folder: Path = FOLDER) -> None:
         fitted = consistency.fitted(model, MATCHED_SCENE, SCENE_SEED, SCENE_FRAMES)
         _save(consistency.steps(fitted), folder / "consistency.webp")
         _save(consistency.surfaces(fitted), folder / "surfaces.webp")
+        _save(extension.grown(model, MATCHED_SCENE, SCENE_SEED, 2 * SCENE_FRAMES, SCENE_SIDE), folder / "extended.webp")
         for number, scene in enumerate(scenes):
             _save(gallery_sheet(scene, number), folder / f"scene-{number}.webp")
             write_film(folder / f"turntable-{number}.webp", film_frames(scene.result, **_TURNTABLE), _TURNTABLE["fps"])
@@ -81,7 +83,7 @@ def made_of() -> str:
 
     digest = hashlib.sha256(vggtjax.__version__.encode())
     embedded = Path(vggtjax.__file__).parent / "pipeline/pretrained"
-    code = (Path(__file__), Path(__file__).with_name("consistency.py"))
+    code = (Path(__file__), *(Path(__file__).with_name(f"{name}.py") for name in ("consistency", "extension")))
     for path in (*code, embedded / "model.safetensors", embedded / "clip.npz"):
         digest.update(path.read_bytes())
     return digest.hexdigest()

@@ -31,6 +31,7 @@ from vggtjax.interface.commands.demo import demo
 from vggtjax.interface.commands.doctor import doctor
 from vggtjax.interface.commands.evaluate import evaluate
 from vggtjax.interface.commands.export import export
+from vggtjax.interface.commands.extend import extend
 from vggtjax.interface.commands.fit_fusion import fit_fusion
 from vggtjax.interface.commands.flags import REGISTRY
 from vggtjax.interface.commands.reconstruct import reconstruct
@@ -58,6 +59,7 @@ COMMANDS = {
     "demo": Command(demo, _START, "reconstruct the clip that comes with the package, and measure it"),
     "reconstruct": Command(reconstruct, _START, "cameras, depth, masks and a 4-D point cloud of a clip"),
     "batch": Command(batch, _START, "the same for many clips; resumes where it was interrupted"),
+    "extend": Command(extend, _START, "add frames of the same place to a finished result"),
     "view": Command(view, _RESULTS, "play results in a browser, or write them as one page"),
     "render": Command(render, _RESULTS, "films of a result: around it, or along its cameras"),
     "app": Command(app, _RESULTS, "a page to drop a video on"),

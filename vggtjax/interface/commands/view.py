@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import os
 import sys
+import threading
+import time
 import webbrowser
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from vggtjax.errors import InputError
+from vggtjax.errors import InputError, VggtjaxError
 from vggtjax.interface.commands.arguments import Overwrite
 from vggtjax.interface.commands.flags import InWords, Switch
 from vggtjax.interface.commands.report import Report
@@ -21,9 +25,11 @@ from vggtjax.storage.interruption import handled
 from vggtjax.storage.writing import check_file
 
 if TYPE_CHECKING:
+    from vggtjax.results.reconstruction import Reconstruction
     from vggtjax.results.result import Result
 
 _POINTS = 500_000, 1_500_000  # static and moving ones that are served; a file that is mailed has fewer
+_LOOK = 1.0  # seconds between looks at whether a result was replaced
 _RESULTS = tyro.conf.arg(metavar="RESULT [RESULT ...]", help_behavior_hint="(required)")
 
 
@@ -98,19 +104,26 @@ def view(
     if export is not None:
         report.line(f"Open in a browser: {export}")
     else:
-        serve(report, loaded, names, serving)
+        serve(report, loaded, names, serving, partial(_changed, results) if format == "vggtjax" else None)
 
 
-def serve(report: Report, results: Sequence[Result], names: Sequence[str], serving: Serving = Serving(port=0)) -> None:
-    """Serve the viewer, say where, open a browser, and wait for Ctrl-C."""
+def serve(
+    report: Report,
+    results: Sequence[Result],
+    names: Sequence[str],
+    serving: Serving = Serving(port=0),
+    changed: Callable[[], Iterator[Sequence[Result]]] | None = None,
+) -> None:
+    """Serve the viewer, say where, open a browser, and wait for Ctrl-C; `changed` yields results that were replaced."""
     from vggtjax.results.viewer.server import PageServer
 
-    with PageServer("", host=serving.host, port=serving.port) as server:  # a port in use is found before the work
+    with PageServer(host=serving.host, port=serving.port) as server:  # a port in use is found before the work
         with report.running(), report.stage("choose points") as progress:
             from vggtjax.results.viewer.page import viewer_page
             from vggtjax.results.viewer.scene import Budget
 
-            server.page = viewer_page(results, names=names, budget=Budget(*_POINTS), progress=progress).encode()
+            page_of = partial(viewer_page, names=names, budget=Budget(*_POINTS))
+            server.show(page_of(results, progress=progress))
         report.line(f"The viewer: {server.access.url}   (Ctrl-C ends it)")
         if connection := os.environ.get("SSH_CONNECTION", "").split():
             if server.access.token is None:
@@ -118,11 +131,30 @@ def serve(report: Report, results: Sequence[Result], names: Sequence[str], servi
                 report.line(f"On your own machine, first: ssh -L {port}:{serving.host}:{port} {connection[2]}")
         elif not serving.no_browser and not _open_browser(server.access.url):
             report.line("No browser could be opened here; open the address in one.")
+        if changed is not None:
+            threading.Thread(target=lambda: [server.show(page_of(new)) for new in changed()], daemon=True).start()
         try:
             server.serve_forever()
         except KeyboardInterrupt:
             handled()
             report.line("The viewer has ended.")
+
+
+def _changed(paths: Sequence[Path]) -> Iterator[list[Reconstruction]]:
+    """Yield the results whenever one of them has been replaced, as one that grows."""
+    from vggtjax.results.folder import find_archive
+    from vggtjax.results.reconstruction import Reconstruction
+
+    def times() -> list[int]:
+        return [(find_archive(path) if path.is_dir() else path).stat().st_mtime_ns for path in paths]
+
+    known = times()
+    while True:
+        time.sleep(_LOOK)
+        with suppress(OSError, VggtjaxError):  # while it is replaced; the next look finds it whole
+            if (now := times()) != known:
+                yield [Reconstruction.load(path) for path in paths]
+                known = now
 
 
 def _names(paths: Sequence[Path]) -> list[str]:

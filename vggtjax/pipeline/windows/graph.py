@@ -22,6 +22,7 @@ _FREEDOM = 7  # logarithm of the scale, rotation vector, translation
 _OUTLIER = 0.1  # relative: an edge that asks for much more of the others loses its say
 _SETTLED, _MOST_ROUNDS = 1e-9, 100
 _STEP = 1e-5  # of numerical derivatives
+LEAST_RESIDUAL = 0.005  # of joins, relative to depth: smaller ones do not tell a better join
 IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
 
 
@@ -32,6 +33,11 @@ class Edge(NamedTuple):
     second: int
     similarity: Similarity  # second -> first
     weight: float = 1.0
+
+
+def edge_of(first: int, second: int, similarity: Similarity, residual: float, usual: float) -> Edge:
+    """Return an edge whose weight is the greater the better its join fits, compared with the usual one."""
+    return Edge(first, second, similarity, max(usual, LEAST_RESIDUAL) / max(residual, LEAST_RESIDUAL))
 
 
 class _Batch(NamedTuple):

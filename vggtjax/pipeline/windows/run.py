@@ -43,6 +43,7 @@ from vggtjax.pipeline.running import Running
 from vggtjax.pipeline.steps import Execute
 from vggtjax.pipeline.windows.frames import SeenFrames, count_frames, window_clips
 from vggtjax.pipeline.windows.join import JoinRule
+from vggtjax.pipeline.windows.overlap import thinned
 from vggtjax.pipeline.windows.plan import Windows, plan_windows
 from vggtjax.pipeline.windows.store import FOLDER, WindowStore, write_cut
 from vggtjax.pipeline.windows.tracks import Follow, Images, Tracked, TrackStart
@@ -67,6 +68,7 @@ class Tools(NamedTuple):
 
     run: Callable[[Clip], Reconstruction]
     describe: Callable[[Float32[np.ndarray, "F H W 3"]], Float32[np.ndarray, "F C"]]  # features for finding loops
+    patches: Callable[[Float32[np.ndarray, "F H W 3"]], tuple[Float32[np.ndarray, "F N C"], int]] | None = None
     follow: Follow | None = None
     check_track_size: Callable[[int, int], None] = lambda height, width: None  # raises InputError for small frames
 
@@ -171,8 +173,15 @@ def tools_of(
             model.params, images, config=config, compute_dtype=compute.compute_dtype, remat=compute.remat
         )
 
+    def tokens(images: Float32[np.ndarray, "F H W 3"]) -> Float32[np.ndarray, "F P C"]:
+        return np.asarray(features(jax.device_put(images[None])).patch_tokens[0], np.float32)
+
     def describe(images: Float32[np.ndarray, "F H W 3"]) -> Float32[np.ndarray, "F C"]:
-        return np.asarray(features(jax.device_put(images[None])).patch_tokens[0], np.float32).mean(axis=1)
+        return tokens(images).mean(axis=1)
+
+    def patches(images: Float32[np.ndarray, "F H W 3"]) -> tuple[Float32[np.ndarray, "F N C"], int]:
+        height, width = (side // config.patch_size for side in images.shape[1:3])
+        return thinned(tokens(images), (height, width))
 
     def follow(images: Images, starts: Sequence[TrackStart]) -> list[Tracked]:
         frames = jax.device_put(images[None])
@@ -184,7 +193,7 @@ def tools_of(
             found.append(Tracked(*(np.asarray(value)[0] for value in tracks)))
         return found
 
-    return Tools(run, describe, follow, partial(check_track_size, config=config))
+    return Tools(run, describe, patches, follow, partial(check_track_size, config=config))
 
 
 def run_windows(

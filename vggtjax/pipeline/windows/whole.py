@@ -20,7 +20,7 @@ from vggtjax.clips.clip import Clip
 from vggtjax.clips.queries import Queries
 from vggtjax.pipeline.windows.blend import WindowView, blend_frame
 from vggtjax.pipeline.windows.frames import clip_of
-from vggtjax.pipeline.windows.graph import Edge, solve_graph
+from vggtjax.pipeline.windows.graph import LEAST_RESIDUAL, Edge, edge_of, solve_graph
 from vggtjax.pipeline.windows.join import Join, JoinRule, join_windows, reach_of
 from vggtjax.pipeline.windows.loops import Loop, described_frames, find_loops, frames_around
 from vggtjax.pipeline.windows.plan import blend_weights, shared_frames
@@ -33,7 +33,6 @@ from vggtjax.results.result import ARRAYS
 _LOOPS = 0.5  # tried, at most, for each window
 _WORSE = 2.0  # times the usual residual of neighbours; a loop window that fits worse shows another place
 _WORST = 0.2  # residual of a loop, relative to depth
-_LEAST_RESIDUAL = 0.005  # smaller ones do not tell a better join
 
 NO_TRACKS: Mapping[str, np.ndarray] = MappingProxyType({})
 
@@ -126,11 +125,11 @@ class Whole:
                 (progress or no_progress)(number + 1, len(self.windows))
         usual = self._usual()
         for number, join in enumerate(self.joins):
-            edges.append(_edge(number, number + 1, join.similarity, join.residual, usual))
+            edges.append(edge_of(number, number + 1, join.similarity, join.residual, usual))
         return edges, reaches
 
     def _usual(self) -> float:
-        return max(float(np.median([join.residual for join in self.joins])), _LEAST_RESIDUAL)
+        return max(float(np.median([join.residual for join in self.joins])), LEAST_RESIDUAL)
 
     def _loop_edges(self, like: Clip) -> list[Edge]:
         """Return edges between windows that show one place again, each verified by a window of its own."""
@@ -171,7 +170,7 @@ class Whole:
         if not used:
             return None
         between_both = to_first.similarity.after(to_second.similarity.inverse())
-        return _edge(loop.first, loop.second, between_both, worst, usual)
+        return edge_of(loop.first, loop.second, between_both, worst, usual)
 
     def _blended(self, worlds: Sequence[Similarity], tracks: Mapping[str, np.ndarray]) -> Reconstruction:
         """Return the result, written frame by frame into mapped files; windows are loaded when frames need them."""
@@ -236,8 +235,3 @@ def store_window(
     if store.find(name, clip.frame_names, np.round(clip.images * 255).astype(np.uint8)) is None:
         described = [frame - window.start for frame in described_frames(window)]
         store.save(name, run(clip), describe(clip.images[described]))
-
-
-def _edge(first: int, second: int, similarity: Similarity, residual: float, usual: float) -> Edge:
-    """Return an edge whose weight is the greater the better its join fits, compared with the usual one."""
-    return Edge(first, second, similarity, usual / max(residual, _LEAST_RESIDUAL))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from urllib.parse import urlsplit
@@ -28,14 +29,18 @@ class PageServer(ThreadingHTTPServer):
 
     daemon_threads = True
 
-    def __init__(self, page: str, *, host: str = "127.0.0.1", port: int = 8080) -> None:
-        self.page = page.encode()
+    def __init__(self, page: str = "", *, host: str = "127.0.0.1", port: int = 8080) -> None:
+        self.show(page)
         opened = listening(host, port)
         super().__init__((host, port), _Handler, bind_and_activate=False)
         self.socket.close()
         self.socket, self.server_address = opened, opened.getsockname()
         self.server_name, self.server_port = host, opened.getsockname()[1]
         self.access = Access(host, self.server_port, token_for(host))
+
+    def show(self, page: str) -> None:
+        """Serve another page from now on; an open browser asks for its tag every few seconds, and loads it anew."""
+        self.page, self.tag = page.encode(), f'"{secrets.token_hex(8)}"'
 
     def handle_error(self, request: object, client_address: object) -> None:
         """Say nothing of a browser that hangs up."""
@@ -57,7 +62,9 @@ class _Handler(BaseHTTPRequestHandler):
         elif admitted == "enter":
             self._answer(HTTPStatus.SEE_OTHER, b"", **{"Location": ".", "Set-Cookie": access.cookie})
         else:
-            self._answer(HTTPStatus.OK, self.server.page, "text/html")
+            self._answer(HTTPStatus.OK, self.server.page, "text/html", ETag=self.server.tag)
+
+    do_HEAD = do_GET  # noqa: N815 - http.server's name
 
     def log_message(self, format: str, *args: object) -> None:
         """Log nothing: a request's address may hold the token."""
@@ -70,4 +77,5 @@ class _Handler(BaseHTTPRequestHandler):
         for name, value in (headers | more).items():
             self.send_header(name, value)
         self.end_headers()
-        self.wfile.write(body)
+        if self.command != "HEAD":
+            self.wfile.write(body)

@@ -16,4 +16,19 @@ async function main() {
   }
 }
 
+// Loads the page anew when the server has another one, as of a result that grows.
+async function watch(seconds) {
+  let known = null;
+  for (;;) {
+    try {
+      const tag = (await fetch(location.href, { method: "HEAD" })).headers.get("ETag");
+      if (tag === null) return;
+      if (known !== null && tag !== known) location.reload();
+      known = tag;
+    } catch {}  // the server has ended, or starts again
+    await new Promise((resolve) => setTimeout(resolve, 1000 * seconds));
+  }
+}
+
 main();
+if (location.protocol.startsWith("http")) watch(3);

@@ -1,0 +1,73 @@
+"""Halves of generated walks joined by `extend`, beside one run over all frames and two runs joined by their cameras."""
+
+from __future__ import annotations
+
+import logging
+import sys
+
+import numpy as np
+from jaxtyping import Float
+
+from vggtjax.cameras import align, checked_centres, umeyama_sim3
+from vggtjax.clips.truth import Truth
+from vggtjax.errors import InputError
+from vggtjax.options import Options
+from vggtjax.pipeline.pretrained.load import load_model
+from vggtjax.pipeline.run import reconstruct
+from vggtjax.pipeline.windows.extend import Extending
+from vggtjax.pipeline.windows.extend import extend as extended
+from vggtjax.training.scenes import SceneConfig, held_out_scenes
+
+_SHARED = 4  # frames that the two runs share, whose cameras join them
+
+
+def extend(*, model: str = "demo", clips: int = 16, frames: int = 24, side: int = 96, seed: int = 0) -> None:
+    """Print path errors of three ways to reconstruct a walk, and whether frames of another scene are refused.
+
+    The error is the root mean square distance of the camera centres from the truth after Sim(3), in median depths.
+
+    Args:
+        model: "demo", or weights as for vggtjax reconstruct.
+        clips: held-out generated scenes with movers, at least 2.
+        frames: of a walk, an even number.
+        side: of the frames, in pixels.
+        seed: of the scenes.
+    """
+    if clips < 2 or frames % 2 or frames < 12:
+        raise InputError(f"clips is {clips} and frames is {frames}; expected at least 2, and an even number from 12 on")
+    logging.disable(logging.WARNING)
+    network, half = load_model(model), frames // 2
+    scenes = held_out_scenes("dynamic", clips, SceneConfig(height=side, width=side, frames=frames), seed=seed)
+    images, options, errors, refused = np.round(255 * scenes.images).astype(np.uint8), Options(), [], 0
+    how = Extending(prefix="new_")
+    for number in range(clips):
+        truth = Truth(*(np.asarray(getattr(scenes, name))[number] for name in Truth._fields))
+        first, whole, late = (
+            reconstruct(network, images[number][part], options=options)
+            for part in (slice(0, half), slice(0, frames), slice(half - _SHARED, frames))
+        )
+        both = extended(network, first, images[number][half:], extending=how, options=options)
+        shared = (
+            checked_centres(poses) for poses in (late.camera_from_world[:_SHARED], first.camera_from_world[-_SHARED:])
+        )
+        joined = align(late.camera_from_world[_SHARED:], umeyama_sim3(*shared, allow_line=True))
+        by_cameras = np.concatenate([first.camera_from_world, joined])
+        errors.append(
+            [_path_error(poses, truth) for poses in (whole.camera_from_world, both.camera_from_world, by_cameras)]
+        )
+        try:
+            extended(network, first, images[(number + 1) % clips][half:], extending=how, options=options)
+        except InputError:
+            refused += 1
+        sys.stderr.write(f"{number + 1} of {clips}: {np.round(errors[-1], 4).tolist()}\n")
+    means = np.mean(errors, axis=0)
+    names = ("one run over all frames", "extend", f"two runs joined by {_SHARED} cameras")
+    rows = [f"| {name} | {mean:.4f} | {mean / means[0]:.2f} |" for name, mean in zip(names, means, strict=True)]
+    table = ["| path error, median depths | mean | compared with one run |", "|---|---|---|", *rows]
+    sys.stdout.write("\n".join([*table, "", f"{refused} of {clips} clips of another scene are refused", ""]))
+
+
+def _path_error(camera_from_world: Float[np.ndarray, "S 3 4"], truth: Truth) -> float:
+    found, true = checked_centres(camera_from_world), checked_centres(truth.camera_from_world)
+    away = np.linalg.norm(umeyama_sim3(found, true, allow_line=True).apply(found) - true, axis=1)
+    return float(np.sqrt((away**2).mean()) / np.median(truth.depth[truth.depth > 0]))
