@@ -327,3 +327,5 @@ DA3 = {  # by the names in the published config.json
     "da3-large": _da3(1024, 8, (1, 3, 5, 7), 256, (256, 512, 1024, 1024)),
     "da3-giant": _da3(1536, 13, (2, 6, 9, 12), 256, (256, 512, 1024, 1024), gated_mlp=4096, leading_global=True),
 }
+
+PUBLISHED = {"VGGT-1B": vggt_1b()} | {name.upper(): config for name, config in DA3.items()}

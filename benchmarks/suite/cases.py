@@ -12,20 +12,20 @@ from jaxtyping import Array, Float
 
 from benchmarks.suite.work import Grid
 from tests.shared.seeded import seeded_images
-from vggtjax.config import VGGTConfig
+from vggtjax.config import DA3, VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.network.layers import Params
 from vggtjax.network.model import init_params
 from vggtjax.pipeline.pretrained.embedded import demo_model
 
-Size = Literal["tiny", "demo", "full"]
+Size = Literal["tiny", "demo", "full", "da3-small", "da3-base"]
 DType = Literal["float32", "bfloat16"]
 
 TINY = VGGTConfig(
     image_size=56, embed_dim=16, depth=4, num_heads=2, dino_depth=1, dino_num_heads=2, camera_depth=1,
     camera_num_heads=2, dpt_features=8, dpt_channels=(8, 8, 8, 8), taps=(0, 1, 2, 3), heads=("camera", "depth"),
 )  # fmt: skip
-_FULL_FRAME = (294, 518)
+_FRAMES = {"full": (294, 518), "da3-small": (280, 504), "da3-base": (280, 504)}  # 16 : 9; others have square ones
 _PAGE = 4096
 
 
@@ -57,6 +57,8 @@ class Case:
 
 def config_of(size: Size) -> VGGTConfig:
     """Return the configuration of a size, without weights."""
+    if size in DA3:
+        return DA3[size]
     return {"tiny": lambda: TINY, "demo": lambda: demo_model().config, "full": VGGTConfig}[size]()
 
 
@@ -73,7 +75,7 @@ def load(size: Size) -> tuple[VGGTConfig, Params]:
 
 def frame_size(size: Size, config: VGGTConfig, height: int | None, width: int | None) -> tuple[int, int]:
     """Return height and width in pixels; the defaults of `size` where None."""
-    own = _FULL_FRAME if size == "full" else (config.image_size, config.image_size)
+    own = _FRAMES.get(size, (config.image_size, config.image_size))
     sides = (own[0] if height is None else height, own[1] if width is None else width)
     for name, side in zip(("height", "width"), sides, strict=True):
         if side < config.patch_size or side % config.patch_size:

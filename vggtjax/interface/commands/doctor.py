@@ -121,21 +121,22 @@ def _longest_clips() -> Iterator[dict[str, Any]]:
 
 
 def _longest_on(gpu: str) -> Iterator[dict[str, Any]]:
-    """Yield the most frames that are predicted to fit on a GPU, of VGGT-1B with blocks in bfloat16, by size."""
+    """Yield the most frames that are predicted to fit on a GPU, of models with blocks in bfloat16, by size."""
     import jax
 
-    from vggtjax.config import vggt_1b
+    from vggtjax.config import PUBLISHED
     from vggtjax.network.kernels.narrow import narrowed
     from vggtjax.network.model import parameter_shapes
     from vggtjax.pipeline import memory
     from vggtjax.pipeline.windows.choice import Planned
 
-    shapes = jax.eval_shape(lambda params: narrowed(params, "bfloat16"), parameter_shapes(vggt_1b()))
-    size = sum(prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(shapes))
-    model, room = Planned(vggt_1b(), size), memory.room_of_gpu(gpu)
-    for shape, (width, height) in _SHAPES.items():
-        frames = memory.most_frames(model, height, width, room.size, accelerator=True)
-        yield _clip(f"VGGT-1B on {gpu}, {shape}", size, width, height, frames)
+    room = memory.room_of_gpu(gpu)
+    for name, config in PUBLISHED.items():
+        shapes = jax.eval_shape(lambda params: narrowed(params, "bfloat16"), parameter_shapes(config))
+        size = sum(prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(shapes))
+        for shape, (width, height) in _SHAPES.items():
+            frames = memory.most_frames(Planned(config, size), height, width, room.size, accelerator=True)
+            yield _clip(f"{name} on {gpu}, {shape}", size, width, height, frames)
 
 
 def _clip(model: str, weights: int, width: int, height: int, frames: int | None) -> dict[str, Any]:
@@ -143,11 +144,11 @@ def _clip(model: str, weights: int, width: int, height: int, frames: int | None)
 
 
 def _known_models() -> Iterator[tuple[str, Any]]:
-    """Yield name and size of the embedded model, of VGGT-1B, and of the conversions in the cache."""
+    """Yield name and size of the embedded model, of published ones, and of the conversions in the cache."""
     import jax
     import numpy as np
 
-    from vggtjax.config import vggt_1b
+    from vggtjax.config import PUBLISHED
     from vggtjax.network.checkpoint import checkpoint_config
     from vggtjax.network.model import parameter_shapes
     from vggtjax.pipeline.pretrained.embedded import MODEL
@@ -155,9 +156,10 @@ def _known_models() -> Iterator[tuple[str, Any]]:
 
     with suppress(VggtjaxError, OSError):  # a package without its model is no reason to say nothing
         yield "demo", Planned(checkpoint_config(MODEL), MODEL.stat().st_size)
-    count = sum(prod(leaf.shape) for leaf in jax.tree.leaves(parameter_shapes(vggt_1b())))
-    for dtype in ("float32", "bfloat16"):
-        yield f"VGGT-1B, {dtype}", Planned(vggt_1b(), count * np.dtype(jax.numpy.dtype(dtype)).itemsize)
+    for name, config in PUBLISHED.items():
+        count = sum(prod(leaf.shape) for leaf in jax.tree.leaves(parameter_shapes(config)))
+        for dtype in ("float32", "bfloat16"):
+            yield f"{name}, {dtype}", Planned(config, count * np.dtype(jax.numpy.dtype(dtype)).itemsize)
     for path in cache_parts()[CONVERTED]:
         with suppress(VggtjaxError, OSError):  # a damaged file is converted anew when it is used
             yield path.stem, Planned(checkpoint_config(path), path.stat().st_size)
