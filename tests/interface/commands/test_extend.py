@@ -1,16 +1,20 @@
 """vggtjax extend: a result of the embedded model grows; what does not fit is refused and nothing is written."""
 
+from pathlib import Path
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from PIL import Image
 
 from tests.shared.contents import contents
 from vggtjax import Reconstruction, load_model, reconstruct
-from vggtjax.errors import InputError
 from vggtjax.interface.commands import extend as command
 from vggtjax.interface.commands import main as cli
 from vggtjax.interface.commands.report import Report
 from vggtjax.pipeline.pretrained.embedded import demo_clip
+from vggtjax.pipeline.windows.extend import fitter_of
+from vggtjax.pipeline.windows.growth import PlaceError
 
 OLD, NEW = range(5), range(5, 8)
 
@@ -67,8 +71,9 @@ def test_what_does_not_fit_is_refused_and_nothing_is_written(result, pictures, t
         ((noise, "--out", out), "show another place"),
         ((wide, "--out", out), "expected frames of the same shape"),
         ((noise, "--out", result), "the folder of the result, which stays as it is"),
-        ((noise, "--out", out, "--anchors", 2), "expected at least 3 anchors"),
-        ((noise / "000100.png", "--out", out, "--watch"), "is no folder"),
+        ((noise, "--out", out, "--anchors", 2), "--anchors is 2"),
+        ((noise / "000100.png", "--out", out, "--watch"), "one folder that fills with pictures"),
+        ((noise, "--out", out, "--watch", "--stride", 2), "--watch takes every picture that comes"),
         ((), "required"),
     ):
         try:
@@ -81,26 +86,52 @@ def test_what_does_not_fit_is_refused_and_nothing_is_written(result, pictures, t
     assert contents(result) == before
 
 
-def test_a_folder_that_fills_is_watched_until_ctrl_c(result, pictures, tmp_path, monkeypatch):
-    """Pictures that come are added; those of another place wait for others; Ctrl-C ends with what there is."""
-    folder, old = written(tmp_path / "capture", pictures[5:6]), Reconstruction.load(result)
-    calls, steps = [], iter([lambda: Image.fromarray(pictures[6]).save(folder / "later.png"), lambda: None])
-    now = iter(np.arange(0, 1000, 2.0))
-    monkeypatch.setattr(command.time, "monotonic", lambda: next(now))
+def test_a_kill_while_writing_loses_no_window(result, pictures, tmp_path, monkeypatch, capsys):
+    def stop(*_, **__):
+        raise OSError(28, "no space left")
+
+    new = written(tmp_path / "new", pictures[NEW.start : NEW.stop], first=100)
+    with monkeypatch.context() as patch:
+        patch.setattr(Reconstruction, "save", stop)
+        assert extended(capsys, result, new, "--out", tmp_path / "both")[0] == 2
+    monkeypatch.setattr("vggtjax.pipeline.windows.run.reconstruct", None)  # is not called again
+    assert extended(capsys, result, new, "--out", tmp_path / "both")[0] == 0
+    assert len(Reconstruction.load(tmp_path / "both").depth) == len(OLD) + len(NEW)
+
+
+def test_a_folder_that_fills_is_watched_until_ctrl_c(result, pictures, tmp_path, monkeypatch, capsys):
+    """Pictures that come are added, those of another place wait, broken ones are left out; Ctrl-C ends it."""
+    folder, old, calls = written(tmp_path / "capture", pictures[5:7], first=5), Reconstruction.load(result), []
+    clock = iter(np.arange(0, 1000, 2.0))
+    monkeypatch.setattr(command.time, "monotonic", lambda: next(clock))
+
+    def more():
+        Image.fromarray(pictures[7]).save(folder / "later.png")
+        (folder / "broken.png").write_bytes(b"\x89PNG")
+        Image.fromarray(pictures[7, :56]).save(folder / "wide.png")
+        (folder / "._later.png").write_bytes(b"")
+
+    steps = iter([*[lambda: None] * 4, more, *[lambda: None] * 4])
 
     def sleep(_):
-        if len(calls) == 2:
+        step = next(steps, None)
+        if step is None:
             raise KeyboardInterrupt
-        next(steps, lambda: None)()
+        step()
 
-    def grown(result, source):
-        calls.append(source.frame_names)
-        if len(calls) == 1:
-            raise InputError("the new frames show another place")
-        names = tuple(f"x_{name}" for name in source.frame_names)
-        return type("Result", (), {"frame_names": result.frame_names + names, "depth": np.zeros(9)})()
+    def grown(result, paths):
+        names = [Path(path).stem for path in paths]
+        calls.append(names)
+        if "later" not in names and "000006" in names:
+            raise PlaceError("000006 shows another place", ["x_000006"])
+        return SimpleNamespace(frame_names=(*result.frame_names, *(f"x_{n}" for n in names)), images=result.images)
 
     monkeypatch.setattr(command.time, "sleep", sleep)
-    both = command._watched(folder, old, grown, "x_", Report())
-    assert calls == [("000000",), ("000000", "later")]
-    assert both.frame_names[-2:] == ("x_000000", "x_later")
+    fitter = fitter_of(old)
+    both = command._watched(folder, old, grown, fitter, "x_", Report())
+    assert calls == [["000005", "000006"], ["000005"], ["000006", "later"]]
+    assert both.frame_names[len(OLD) :] == ("x_000005", "x_000006", "x_later")
+    said = " ".join(capsys.readouterr().err.split())
+    assert "broken.png is left out until it changes" in said
+    assert "wide.png is left out until it changes: it is fitted to 96 x 56 pixels" in said
+    assert said.count("left out until") == 2

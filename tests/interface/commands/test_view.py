@@ -1,6 +1,8 @@
 """The commands view and render: what they write, and one sentence for what they cannot do."""
 
 import socket
+import threading
+import urllib.request
 
 import av
 import pytest
@@ -9,6 +11,7 @@ from PIL import Image
 from tests.shared.command import refusal, run
 from tests.shared.room import make_room
 from vggtjax.errors import InputError
+from vggtjax.interface.commands import view
 from vggtjax.results.viewer.page import viewer_page
 from vggtjax.results.viewer.server import PageServer
 
@@ -77,7 +80,7 @@ class Ended:
             monkeypatch.setenv("SSH_CONNECTION", "198.51.100.2 50000 198.51.100.7 22")
 
     def end(self, server):
-        self.page, self.port = server.page.decode(), server.server_port
+        self.page, self.port = server.shown.page.decode(), server.server_port
         raise KeyboardInterrupt
 
 
@@ -162,3 +165,28 @@ def test_a_film_of_bad_input_is_refused(result, tmp_path, capsys, arguments, mes
     words = [argument.format(**places) for argument in arguments]
     assert message.format(**places) in refusal(capsys, "render", *words)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_page_that_is_served_is_loaded_anew_when_its_result_was_replaced(tmp_path, monkeypatch):
+    make_room(2).save(tmp_path / "result")
+    known = view._times([tmp_path / "result"])
+    make_room(3).save(tmp_path / "result")
+    monkeypatch.setattr(view.time, "sleep", lambda _: None)
+    assert len(next(view._changed([tmp_path / "result"], known))[0].depth) == 3
+    exported = viewer_page([make_room(2)])
+    assert "connect-src" not in exported.split("<script")[0]
+    with PageServer(exported, port=0) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        tags = []
+        for _ in range(2):
+            request = urllib.request.Request(server.access.url, method="HEAD")
+            with urllib.request.urlopen(request) as answer:
+                assert answer.read() == b""
+                tags.append(answer.headers["ETag"].strip('"'))
+            with urllib.request.urlopen(server.access.url) as answer:
+                page = answer.read().decode()
+            assert f'<meta name="page" content="{tags[-1]}">' in page
+            assert "connect-src 'self'" in page
+            server.show(exported)
+        server.shutdown()
+    assert tags[0] != tags[1]

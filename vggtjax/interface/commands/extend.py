@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,11 +20,12 @@ from vggtjax.results.saving import Saving
 from vggtjax.storage.interruption import handled
 
 if TYPE_CHECKING:
-    from vggtjax.clips.media.sampling import Source
+    from vggtjax.clips.preprocessing import Fitter
+    from vggtjax.clips.sources import ClipSource
     from vggtjax.results.reconstruction import Reconstruction
 
 _CLIP = tyro.conf.arg(metavar="CLIP [CLIP ...]", help_behavior_hint="(required)")
-_QUIET = 3.0  # seconds without a new picture, after which those that have come are added
+_QUIET = 3.0  # seconds without a change, after which a picture is whole
 _POLL = 0.5  # seconds
 
 
@@ -39,6 +41,7 @@ def extend(
     prefix: InWords[str] = "",
     window: int = 32,
     anchors: int = 8,
+    least_overlap: float = 0.4,
     watch: Switch = False,
 ) -> None:
     """Add frames of the same place to a finished result, in its frame and scale.
@@ -55,15 +58,15 @@ def extend(
         out: folder for the new result
         prefix: letters before the names of the new frames, such as day2_, where they have names of old ones.
         window: frames that are run together, anchors and new ones.
-        anchors: how many of them are frames of the result, at least 3.
+        anchors: how many of them are frames that are known already, at least 3.
+        least_overlap: frames that overlap by less, from 0 to 1, show another place.
         watch: CLIP is a folder that still fills, such as that of a capture that is running: add pictures as they come,
             until Ctrl-C. vggtjax view OUT shows the growing scene.
     """
     if not clip:
         raise InputError("no new frames; name a folder of images, a pattern, images, or a video")
-    source = clip[0] if len(clip) == 1 else list(clip)
-    if watch and not Path(clip[0]).is_dir():
-        raise InputError(f"--watch is for a folder that fills with pictures, and {clip[0]} is no folder")
+    if watch:
+        _check_watch(clip, sampling)
     if out.resolve() == (result if result.is_dir() else result.parent).resolve():
         raise InputError(f"--out is {out}, the folder of the result, which stays as it is; choose another folder")
     report = Report()
@@ -71,62 +74,113 @@ def extend(
         from vggtjax.clips.clip import read_clip
         from vggtjax.clips.sources import open_source
         from vggtjax.pipeline.windows import extend as extending
-        from vggtjax.pipeline.windows.plan import Windows
+        from vggtjax.pipeline.windows.store import discard
         from vggtjax.results.folder import check_folder
         from vggtjax.results.reconstruction import Reconstruction
-        from vggtjax.results.report import RunFacts
 
-        how = extending.Extending(prefix, Windows(window, anchors))
+        how = extending.Extending(prefix, window, anchors, least_overlap)
         with report.stage("read"):
             old = Reconstruction.load(result)
         check_folder(out, saving.names(tracks=old.track_frames is not None))
-        options = extending.options_of(old)
-        opened = None if watch else open_source(source)
+        options, fitter = extending.options_of(old), extending.fitter_of(old)
+        source = None if watch else open_source(clip[0] if len(clip) == 1 else list(clip))
         model, fusion = files.load(report, options, [options.method])
         extending.check_result(model, old)
-        fitter = extending.fitter_of(old)
 
-        def grown(old: Reconstruction, new: Source) -> Reconstruction:
+        def grown(old: Reconstruction, new: ClipSource, which: Sampling = Sampling()) -> Reconstruction:
             with report.stage("load clip") as progress:
-                read = read_clip(new, sampling, fitter, progress)
-            joined = extending.extend(
-                model, old, read, out=out, extending=how, options=options, fusion=fusion, on_stage=report.stage
-            )
-            with report.stage("write") as progress:
-                joined.save(out, saving=saving, progress=progress, facts=RunFacts(report.seconds))
-            return joined
+                frames = read_clip(open_source(new), which, fitter, progress)
+            given = {"extending": how, "options": options, "fusion": fusion, "saving": saving}
+            return extending.extend(model, old, frames, out=out, on_stage=report.stage, **given)
 
-        old = _watched(Path(clip[0]), old, grown, prefix, report) if opened is None else grown(old, opened)
-    report.summary(old, out, model)
+        both = _watched(Path(clip[0]), old, grown, fitter, prefix, report) if watch else grown(old, source, sampling)
+        if watch:
+            discard(out)
+    if both is old:
+        report.line("No picture was added.")
+    else:
+        report.summary(both, out, model)
+
+
+def _check_watch(clip: tuple[str, ...], sampling: Sampling) -> None:
+    if len(clip) > 1 or not Path(clip[0]).is_dir():
+        raise InputError(f"--watch is for one folder that fills with pictures; {clip[-1]} is none, or one too many")
+    if sampling != Sampling():
+        raise InputError("--watch takes every picture that comes; leave out --start, --stride, --fps and the like")
 
 
 def _watched(
-    folder: Path, result: Reconstruction, grown: Callable[..., Reconstruction], prefix: str, report: Report
+    folder: Path,
+    result: Reconstruction,
+    grown: Callable[[Reconstruction, ClipSource], Reconstruction],
+    fitter: Fitter,
+    prefix: str,
+    report: Report,
 ) -> Reconstruction:
-    """Add pictures to the result as they come into a folder, until Ctrl-C; those that do not fit yet wait for more."""
-    from vggtjax.clips.media.images import ImageFiles, is_image_name
-    from vggtjax.clips.media.order import in_order
+    """Add pictures to the result as they come into a folder, until Ctrl-C.
 
-    report.note(f"waiting for pictures in {folder}; Ctrl-C ends it")
-    sizes: dict[Path, int] = {}
-    tried, since = 0, time.monotonic()
+    A picture is whole when its file has not changed for three seconds. Pictures of another place wait for others.
+    """
+    from vggtjax.clips.media.order import in_order
+    from vggtjax.pipeline.windows.growth import PlaceError
+
+    def is_known(path: Path) -> bool:
+        return prefix + path.stem in result.frame_names
+
+    known = [path.name for path in _pictures(folder) if is_known(path)]
+    note = f"; {len(known)} have names of known frames and are left out, such as {known[0]}" if known else ""
+    report.note(f"waiting for pictures in {folder}{note}; Ctrl-C ends it")
+    since: dict[Path, tuple[int, float]] = {}  # size of a file, and when it had it first
+    broken: dict[Path, int] = {}  # size
+    tried: set[Path] = set()
     try:
         while True:
-            known = set(result.frame_names)
-            now = {p: p.stat().st_size for p in folder.iterdir() if is_image_name(p) and prefix + p.stem not in known}
-            if now != sizes:
-                sizes, since = now, time.monotonic()
-            if len(now) == tried or time.monotonic() - since < _QUIET:
+            now = time.monotonic()
+            sizes = {path: size for path, size in _pictures(folder).items() if not is_known(path)}
+            since = {p: since[p] if p in since and since[p][0] == size else (size, now) for p, size in sizes.items()}
+            whole = [p for p, (size, begun) in since.items() if now - begun >= _QUIET and broken.get(p) != size]
+            for path in set(whole) - tried:
+                if problem := _problem(path, fitter, result.images.shape[1:3]):
+                    report.note(f"{path.name} is left out until it changes: {problem}")
+                    broken[path] = sizes[path]
+                    whole.remove(path)
+            if set(whole) <= tried:
                 time.sleep(_POLL)
                 continue
-            tried = len(now)
-            try:
-                result = grown(result, ImageFiles(tuple(in_order(now))))
-            except InputError as error:
-                report.note(f"{tried} pictures wait for others: {error}")
-            else:
-                tried = 0
-                report.note(f"the result has {len(result.depth)} frames")
+            fitting = whole
+            while fitting:
+                try:
+                    result = grown(result, [str(path) for path in in_order(fitting)])
+                    report.note(f"the result has {len(result.frame_names)} frames")
+                    break
+                except PlaceError as error:
+                    report.note(f"{len(error.frames)} of {len(fitting)} pictures wait for others: {error}")
+                    fitting = [path for path in fitting if prefix + path.stem not in error.frames]
+            tried = {path for path in whole if not is_known(path)}
     except KeyboardInterrupt:
         handled()
         return result
+
+
+def _pictures(folder: Path) -> dict[Path, int]:
+    """Return the pictures in a folder with the sizes of their files."""
+    from vggtjax.clips.media.images import is_image_name
+
+    found = {}
+    for path in folder.iterdir():
+        if is_image_name(path) and not path.name.startswith(".") and path.is_file():
+            with suppress(OSError):  # it was moved away
+                found[path] = path.stat().st_size
+    return found
+
+
+def _problem(path: Path, fitter: Fitter, size: tuple[int, ...]) -> str:
+    """Return why a picture cannot be added: it cannot be read, or is fitted to another size; else an empty text."""
+    from vggtjax.clips.media.images import read_image
+
+    try:
+        width, height = fitter.fit(*read_image(path).size, path.name).frame_size
+    except InputError as error:
+        return str(error)
+    same = (height, width) == tuple(size)
+    return "" if same else f"it is fitted to {width} x {height} pixels and the result has {size[1]} x {size[0]}"

@@ -91,7 +91,7 @@ def view(
         with report.stage("read") as progress:
             from vggtjax.results.reconstruction import Reconstruction
 
-            loaded = []
+            loaded, times = [], _times(results) if format == "vggtjax" else None
             for number, path in enumerate(results):
                 loaded.append(Reconstruction.load(path, format=format, quaternion=quaternion))
                 progress(number + 1, len(results))
@@ -104,7 +104,7 @@ def view(
     if export is not None:
         report.line(f"Open in a browser: {export}")
     else:
-        serve(report, loaded, names, serving, partial(_changed, results) if format == "vggtjax" else None)
+        serve(report, loaded, names, serving, None if times is None else partial(_changed, results, times))
 
 
 def serve(
@@ -131,8 +131,13 @@ def serve(
                 report.line(f"On your own machine, first: ssh -L {port}:{serving.host}:{port} {connection[2]}")
         elif not serving.no_browser and not _open_browser(server.access.url):
             report.line("No browser could be opened here; open the address in one.")
-        if changed is not None:
-            threading.Thread(target=lambda: [server.show(page_of(new)) for new in changed()], daemon=True).start()
+
+        def follow() -> None:
+            for new in changed() if changed is not None else ():
+                with suppress(VggtjaxError):
+                    server.show(page_of(new))
+
+        threading.Thread(target=follow, daemon=True).start()
         try:
             server.serve_forever()
         except KeyboardInterrupt:
@@ -140,21 +145,30 @@ def serve(
             report.line("The viewer has ended.")
 
 
-def _changed(paths: Sequence[Path]) -> Iterator[list[Reconstruction]]:
-    """Yield the results whenever one of them has been replaced, as one that grows."""
+def _times(paths: Sequence[Path]) -> list[int]:
+    """Return when the archive of each result was written; 0 while it is replaced."""
     from vggtjax.results.folder import find_archive
+
+    found = []
+    for path in paths:
+        try:
+            found.append((find_archive(path) if path.is_dir() else path).stat().st_mtime_ns)
+        except OSError:
+            found.append(0)
+    return found
+
+
+def _changed(paths: Sequence[Path], known: list[int]) -> Iterator[list[Reconstruction]]:
+    """Yield the results whenever one of them has been replaced, as one that grows, since the times of `known`."""
     from vggtjax.results.reconstruction import Reconstruction
 
-    def times() -> list[int]:
-        return [(find_archive(path) if path.is_dir() else path).stat().st_mtime_ns for path in paths]
-
-    known = times()
     while True:
         time.sleep(_LOOK)
-        with suppress(OSError, VggtjaxError):  # while it is replaced; the next look finds it whole
-            if (now := times()) != known:
-                yield [Reconstruction.load(path) for path in paths]
-                known = now
+        if (now := _times(paths)) == known or 0 in now:
+            continue
+        with suppress(VggtjaxError):  # while it is replaced; the next look finds it whole
+            yield [Reconstruction.load(path) for path in paths]
+            known = now
 
 
 def _names(paths: Sequence[Path]) -> list[str]:

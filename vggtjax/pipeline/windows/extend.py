@@ -9,79 +9,72 @@ all joins are solved together; the old frames stay as they are, bit by bit
 from __future__ import annotations
 
 import dataclasses
-import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, UInt8
-from scipy.spatial.transform import Rotation
+from jaxtyping import Float32, UInt8
+from PIL import Image
 
-from vggtjax.cameras import align, camera_centres, checked_centres
 from vggtjax.clips.clip import Clip, read_clip
-from vggtjax.clips.fingerprint import source_setting
 from vggtjax.clips.media.sampling import Sampling
 from vggtjax.clips.preprocessing import Fitter
 from vggtjax.clips.sources import ClipSource, open_source
-from vggtjax.errors import InputError, one_line
+from vggtjax.errors import InputError, one_line, whole_number
 from vggtjax.method.fusion.family import FusionParams
+from vggtjax.method.fusion.file import fusion_digest
 from vggtjax.network.checkpoint import Model
-from vggtjax.options import Options
+from vggtjax.options import METHODS, Options
 from vggtjax.pipeline.agreement import agree_with_pixels
-from vggtjax.pipeline.windows.graph import IDENTITY, edge_of, solve_graph
-from vggtjax.pipeline.windows.join import Join, JoinRule, join_windows, reach_of
-from vggtjax.pipeline.windows.overlap import FEWEST_ANCHORS, LEAST_OVERLAP, Places, choose_anchors
-from vggtjax.pipeline.windows.plan import Windows
+from vggtjax.pipeline.running import check_kinds
+from vggtjax.pipeline.windows.growth import Growth, PlaceError, bytes_of, grow
+from vggtjax.pipeline.windows.join import JoinRule
+from vggtjax.pipeline.windows.overlap import FEWEST_ANCHORS, LEAST_OVERLAP
 from vggtjax.pipeline.windows.run import Tools, tools_of
 from vggtjax.pipeline.windows.store import FOLDER, WindowStore
 from vggtjax.pipeline.windows.whole import window_name
-from vggtjax.progress import OnStage, Progress, no_stage
+from vggtjax.progress import OnStage, Progress, StageSeconds, no_stage
+from vggtjax.results.disk import announce, forecast_bytes
+from vggtjax.results.folder import check_folder
 from vggtjax.results.reconstruction import Reconstruction
-from vggtjax.results.report import versions
-from vggtjax.results.result import ARRAYS, TRACKS, missing_fields, show_points, without_mask
+from vggtjax.results.report import RunFacts, versions
+from vggtjax.results.result import missing_fields, without_mask
+from vggtjax.results.saving import Saving
 from vggtjax.storage.interruption import kept
 from vggtjax.storage.writing import locked_folder, write_errors
-
-logger = logging.getLogger(__name__)
-
-DEFAULT = Windows(32, 8)
-_LEAST_STATIC = 0.02  # share of a frame's pixels; with less, an anchor says nothing of where it is
-_WORST = 0.2  # residual of a join, relative to depth; with more, anchors and new frames do not fit together
-_STACKED = tuple(name for name in ARRAYS if name not in {*TRACKS, "timestamps"})
-_OF_CLIP = ("images", "source_size", "source_scale", "source_offset", "valid_box")
-
-
-class _Window(NamedTuple):
-    """New frames that are run together with anchors, which come first."""
-
-    frames: range  # the new frames, by number in the new clip
-    anchors: list[int]  # by number in the joined result
-    joins: dict[int, Join]  # that fit: to the old result (0) and to earlier windows (1, 2, ...)
 
 
 @dataclasses.dataclass(frozen=True)
 class Extending:
-    """How a result is extended.
+    """How a result is extended. Raises InputError for an invalid value.
 
     Attributes:
-        prefix: letters before the names of the new frames, for clips whose frames have the names of old ones
-        windows: frames of a window, and how many of them are anchors, at least 3
-        rule: how anchors join
+        prefix: letters before the names of the new frames, such as day2_, where they have names of old ones
+        window: frames that are run together: anchors and new ones
+        anchors: how many of them are frames that are known already, at least 3
+        least_overlap: frames that overlap by less, from 0 to 1, show another place; measured with the demonstration
+            model alone
     """
 
     prefix: str = ""
-    windows: Windows = DEFAULT
-    rule: JoinRule = JoinRule()
+    window: int = 32
+    anchors: int = 8
+    least_overlap: float = LEAST_OVERLAP
 
     def __post_init__(self) -> None:
-        if not self.windows.window:
-            raise InputError("window is 0 or missing; new frames are run in windows, such as 32 frames with 8 anchors")
-        if self.windows.shared < FEWEST_ANCHORS:
-            raise InputError(f"overlap is {self.windows.shared}; expected at least {FEWEST_ANCHORS} anchors")
+        whole_number("anchors", self.anchors, FEWEST_ANCHORS)
+        whole_number("window", self.window, self.anchors + 1)
+        if not 0 < self.least_overlap < 1:
+            raise InputError(f"least_overlap is {self.least_overlap}; expected a number between 0 and 1")
+
+    def parts(self, frames: int) -> list[range]:
+        """Return the new frames of each window."""
+        length = self.window - self.anchors
+        return [range(start, min(start + length, frames)) for start in range(0, frames, length)]
 
 
 def extend(
@@ -93,6 +86,7 @@ def extend(
     extending: Extending = Extending(),
     options: Options | None = None,
     fusion: FusionParams | None = None,
+    saving: Saving = Saving(),
     on_stage: OnStage = no_stage,
 ) -> Reconstruction:
     """Return a result with the frames of `result`, bit by bit, and behind them those of a clip of the same place.
@@ -104,90 +98,115 @@ def extend(
         model: the one that made the result.
         result: of one clip, of windows, or itself extended.
         clip: the new frames, fitted as those of the result: what `load_clip` returned, or what it takes.
-        out: folder in which windows that are done are kept, so that the same call goes on where a killed run stopped;
-            they are removed at the end, and the result is not written. None: nothing is kept.
+        out: folder that the new result is written to. Windows that are done are kept in it until then, so that the same
+            call goes on where a killed run stopped. None: nothing is written.
         extending: how the new frames are run and joined.
-        options: as for `reconstruct`; by default those of the result.
-        fusion: as for `reconstruct`.
+        options: as for `reconstruct`, of the result's method; by default those of the result. `refine_cameras` is not
+            done.
+        fusion: as for `reconstruct`; the rule that fused the result.
+        saving: how the result is written.
         on_stage: as for `reconstruct`.
 
     Raises:
-        InputError: a result of another model or without stored pictures, frames of another size or of equal names, new
-            frames that show another place, or anchors on which everything moves or that do not agree.
+        InputError: a result of another model or rule of fusion, or without stored pictures; frames of another size or
+            with equal names.
+        PlaceError: new frames that show another place, or anchors on which everything moves or that do not agree.
         ClipError: a source that cannot be read.
         OutputError: `out` cannot be written, or another run is writing it.
         DeviceMemoryError: a window does not fit in the memory of the device.
     """
-    options = options or options_of(result)
     check_result(model, result)
+    options = (options or options_of(result)).changed(refine_cameras=False)
+    check_kinds(model=model, options=options)
+    _check_method(result, options, fusion)
+    seconds = StageSeconds()
+
+    @contextmanager
+    def stage(name: str) -> Iterator[Progress | None]:
+        with seconds.stage(name), on_stage(name) as progress:
+            yield progress
+
+    if out is not None:
+        check_folder(Path(out), saving.names(tracks=result.track_frames is not None))
     if not isinstance(clip, Clip):
-        with on_stage("load clip") as progress:
+        with stage("load clip") as progress:
             clip = read_clip(open_source(clip), Sampling(), fitter_of(result), progress)
     names = [extending.prefix + name for name in clip.frame_names]
     _check_clip(result, clip, names)
-    tools = tools_of(model, options.changed(consistent_depth=False), clip.size, fusion=fusion)
-    read: Clip = clip
-
-    def agree(window: Reconstruction, part: range, anchored: Clip) -> Reconstruction:
-        def pictures() -> Iterator[UInt8[np.ndarray, "h w 3"]]:
-            yield from _bytes(anchored.images[: len(anchored) - len(part)])
-            yield from islice(read.pictures(), part.start, part.stop)
-
-        return agree_with_pixels(window, pictures, options.changed(refine_cameras=False), on_stage=on_stage)
-
+    tools = tools_of(model, options.changed(consistent_depth=False), clip.size, fusion=fusion, pad_frames=True)
+    if out is None:
+        return without_mask(grown(result, clip, names, tools, extending, options, None, stage))
+    sizes = np.concatenate([result.source_size, clip.source_size])
+    announce(out, forecast_bytes((len(sizes), *clip.images.shape[1:3]), sizes, saving))
     settings = {
-        "extend": [result.frame_names, names, extending.windows.window, extending.windows.shared],
+        "extend": [result.frame_names, names, extending.window, extending.anchors],
         "model": model.identity.to_json(),
-        "options": options.to_json(),
+        "options": options.resolved(model.config.motion).to_json(),
+        "fusion": fusion_digest(fusion),
         "versions": versions(),
     }
-    growth = Growth(result, clip, names, extending)
-    if out is None:
-        return without_mask(grow(growth, tools, extending.windows, agree, None, on_stage))
     with _kept_windows(Path(out), settings) as store:
-        return without_mask(grow(growth, tools, extending.windows, agree, store, on_stage))
+        both = without_mask(grown(result, clip, names, tools, extending, options, store, stage))
+        with stage("write") as progress:
+            both.save(out, saving=saving, progress=progress, facts=RunFacts(seconds.seconds))
+    return both
 
 
-@contextmanager
-def _kept_windows(out: Path, settings: Mapping[str, Any]) -> Iterator[WindowStore]:
-    """Yield where windows are kept while they are run: until the end, or until the frames turn out not to fit."""
-    is_new = not out.is_dir()
-    with write_errors(out):
-        out.mkdir(parents=True, exist_ok=True)
-    with locked_folder(out / FOLDER, "the windows of a clip"):
-        store = WindowStore(out, settings)
-        try:
-            with kept(lambda: f"{store.count()} windows are kept; the same command goes on from there"):
-                yield store
-        except InputError:
-            store.remove()
-            if is_new:
-                with suppress(OSError):
-                    out.rmdir()
-            raise
-        store.remove()
+def grown(
+    result: Reconstruction,
+    clip: Clip,
+    names: list[str],
+    tools: Tools,
+    extending: Extending,
+    options: Options,
+    store: WindowStore | None = None,
+    on_stage: OnStage = no_stage,
+    rule: JoinRule = JoinRule(),
+) -> Reconstruction:
+    """Compare the frames, run the windows that are not in the store, and return the joined result."""
+    with on_stage("compare frames") as progress:
+        known, columns = _patches(tools, result.images, progress)
+        new, _ = _patches(tools, clip.images, progress)
+        growth = Growth(result, clip, names, known, new, columns, extending.least_overlap, rule)
+
+    def run(anchored: Clip, part: range) -> Reconstruction:
+        name = window_name(part.start)
+        window = None if store is None else store.find(name, anchored.frame_names, bytes_of(anchored.images))
+        if window is None:
+            window = _agreeing(tools.run(anchored), clip, anchored, part, result, options)
+            if store is not None:
+                store.save(name, window)
+        return window
+
+    with on_stage("windows") as progress:
+        return grow(growth, extending.parts(len(clip)), extending.anchors, run, progress)
 
 
 def options_of(result: Reconstruction) -> Options:
     """Return the options that a result was made with, as far as its settings tell, without `refine_cameras`."""
-    names = {field.name for field in dataclasses.fields(Options)} - {"method", "refine_cameras", "mask"}
+    row = METHODS[result.method]
+    defaults = {"threshold": row.threshold, "mask": row.mask}  # absent from settings where they are the method's own
+    names = {field.name for field in dataclasses.fields(Options)} - {"method", "refine_cameras"}
+    given = defaults | {name: result.settings[name] for name in names & result.settings.keys()}
     try:
-        return Options(result.method, **{name: result.settings[name] for name in names & result.settings.keys()})
+        return Options(result.method, **given)
     except InputError as error:
         raise InputError(f"the settings of the result cannot be taken over: {error}") from error
 
 
 def check_result(model: Model, result: Reconstruction) -> None:
     """Raise InputError where a result is not of this model, or lacks what anchors need."""
+    if not isinstance(result, Reconstruction):
+        raise InputError(f"the result is a {type(result).__name__}; expected what Reconstruction.load returns")
+    if result.method not in METHODS:
+        raise InputError(f"the result is of {one_line(result.method, 40)}; expected one that vggtjax made")
     if result.model_name != model.name:
         raise InputError(
             f"the result is of the model {one_line(result.model_name, 60)!r} and {model.name!r} is given; expected the "
             "model that made the result"
         )
     if missing := {"images", "depth_confidence"} & set(missing_fields(result)):
-        raise InputError(
-            f"the result has no {' or '.join(sorted(missing))} of its frames; expected a result of vggtjax"
-        )
+        raise InputError(f"the result has no {' or '.join(sorted(missing))} of its frames; expected one of vggtjax")
     if (patch := result.settings.get("patch")) != model.config.patch_size:
         raise InputError(f"the result has patches of {patch} pixels; expected {model.config.patch_size}, the model's")
 
@@ -200,6 +219,14 @@ def fitter_of(result: Reconstruction) -> Fitter:
         raise InputError(f"the settings of the result do not tell how its frames were fitted: {error}") from error
 
 
+def _check_method(result: Reconstruction, options: Options, fusion: FusionParams | None) -> None:
+    if options.method != result.method:
+        raise InputError(f"method is {options.method!r}; expected that of the result, {result.method!r}")
+    if (known := result.settings.get("fusion")) != fusion_digest(fusion):
+        rule = "the paper's rule" if known is None else "a rule of its own"
+        raise InputError(f"the result is fused by {rule}, and another one is given; expected the same (--fusion)")
+
+
 def _check_clip(result: Reconstruction, clip: Clip, names: list[str]) -> None:
     sizes = [(array.shape[2], array.shape[1]) for array in (clip.images, result.images)]
     if sizes[0] != sizes[1]:
@@ -208,182 +235,61 @@ def _check_clip(result: Reconstruction, clip: Clip, names: list[str]) -> None:
             f"the new frames are fitted to {a} x {b} pixels and the result has {c} x {d}; expected frames of the same "
             "shape: crop them, or make the result with --preprocess pad"
         )
-    equal = sorted(set(result.frame_names) & set(names))
-    if equal:
+    if equal := sorted(set(result.frame_names) & set(names)):
         more = f" and {len(equal) - 1} more" if len(equal) > 1 else ""
         raise InputError(
             f"the frame {one_line(equal[0], 60)!r}{more} of the new clip has the name of a frame of the result; give "
             "the new ones a prefix, such as --prefix day2_, or leave out frames that the result has"
         )
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise InputError(f"two new frames are named {one_line(twice[0], 60)!r}; expected a name for each")
 
 
-class Growth:
-    """The old result (node 0) and the windows of new frames (nodes 1, 2, ...), while they are run and joined."""
-
-    def __init__(self, result: Reconstruction, clip: Clip, names: list[str], extending: Extending) -> None:
-        self.clip, self.names, self.rule = clip, names, extending.rule
-        self.nodes: list[Reconstruction] = [result]
-        self.windows: list[_Window] = []
-        self.frames = [(0, frame) for frame in range(len(result.depth))]  # node, and number in it
-        self.usable = _shows_static(result)
-        self.centres = camera_centres(result.camera_from_world).astype(np.float64)
-        self.worlds = [IDENTITY]  # along the best join; all are solved together at the end
-
-    def anchored(self, part: range, anchors: list[int]) -> Clip:
-        """Return anchors and new frames as a clip; anchors have the pictures that their results store."""
-        placed = [(self.nodes[node], number) for node, number in map(self.frames.__getitem__, anchors)]
-        count, new, size = len(placed), slice(part.start, part.stop), self.clip.images.shape[1:3]
-
-        def joined(name: str, of_anchors: list[Any]) -> np.ndarray:
-            return np.concatenate([np.stack(of_anchors), getattr(self.clip, name)[new]])
-
-        return dataclasses.replace(
-            self.clip,
-            images=joined("images", [result.images[number] / np.float32(255) for result, number in placed]),
-            frame_names=[result.frame_names[number] for result, number in placed] + self.names[new],
-            timestamps=None,
-            source_size=joined("source_size", [size] * count),
-            source_scale=joined("source_scale", [(1.0, 1.0)] * count),
-            source_offset=joined("source_offset", [(0.0, 0.0)] * count),
-            valid_box=joined("valid_box", [result.valid_box[number] for result, number in placed]),
-        )
-
-    def add(self, part: range, anchors: list[int], window: Reconstruction) -> None:
-        """Join a window by its anchors. Raises InputError where none of its joins fits."""
-        number, pairs = len(self.nodes), {}
-        for position, (node, frame) in enumerate(map(self.frames.__getitem__, anchors)):
-            pairs.setdefault(node, []).append((frame, position))
-        joins = {node: join_windows(self.nodes[node], window, found, self.rule) for node, found in pairs.items()}
-        fits = {node: join for node, join in joins.items() if join.pixels and join.residual <= _WORST}
-        if not fits:
-            best = min(join.residual for join in joins.values())
-            raise InputError(
-                f"the new frames {self.names[part.start]} to {self.names[part.stop - 1]} cannot be joined: depth and "
-                f"cameras of the anchors differ by {best:.0%} of the depth, more than {_WORST:.0%}, or show nothing "
-                "that stands still; expected frames that see the place of the result"
-            )
-        best = min(fits, key=lambda node: fits[node].residual)
-        self.worlds.append(self.worlds[best].after(fits[best].similarity))
-        self.windows.append(_Window(part, anchors, fits))
-        self.nodes.append(window)
-        new = range(len(anchors), len(window.depth))
-        self.frames += [(number, frame) for frame in new]
-        self.usable = np.concatenate([self.usable, _shows_static(window)[new.start :]])
-        poses = align(window.camera_from_world[new.start :], self.worlds[-1])
-        self.centres = np.concatenate([self.centres, checked_centres(poses)])
-
-    def solve(self) -> None:
-        """Solve all joins together; the old result stays."""
-        found = [
-            (join.residual, node, number) for number, w in enumerate(self.windows, 1) for node, join in w.joins.items()
-        ]
-        usual = float(np.median([residual for residual, *_ in found]))
-        edges = [
-            edge_of(node, number, self.windows[number - 1].joins[node].similarity, residual, usual)
-            for residual, node, number in found
-        ]
-        self.worlds = solve_graph(len(self.nodes), edges, [reach_of(node) for node in self.nodes])
-
-    def result(self) -> Reconstruction:
-        """Return the joined result."""
-        old = self.nodes[0]
-        fields = {name: self._stacked(name) for name in _STACKED}
-        fields |= {name: self._untracked(name) for name in TRACKS - {"track_frames"} if old.track_frames is not None}
-        facts = {"clip": self.clip.source.name, "first": len(old.depth), "frames": len(self.clip)}
-        facts |= source_setting(self.clip.source) | {
-            "windows": [self._facts(number) for number in range(len(self.windows))]
-        }
-        extended = old.settings.get("extended")
-        earlier = extended if isinstance(extended, list) else []
-        return dataclasses.replace(
-            old,
-            **fields,
-            frame_names=(*old.frame_names, *self.names),
-            timestamps=_times(old, self.clip),
-            settings=old.settings | {"extended": [*earlier, facts]},
-            passes=None,
-        )
-
-    def _stacked(self, name: str) -> np.ndarray | None:
-        """Return a field of the old frames, and of the new ones in the world of the old."""
-        old = getattr(self.nodes[0], name)
-        if old is None:
-            return None
-        if name in _OF_CLIP:
-            new = [getattr(self.clip, name)]
-            new = [np.round(255 * new[0]).astype(np.uint8)] if name == "images" else new
-        else:
-            new = []
-            for window, node, world in zip(self.windows, self.nodes[1:], self.worlds[1:], strict=True):
-                value = getattr(node, name)
-                if value is None:  # matches that could not be used: all patches are as the median
-                    value = np.ones((len(node.depth), *old.shape[1:]), old.dtype)
-                value = value[len(window.anchors) :]
-                value = world.scale * value if name == "depth" else value
-                new.append(align(value, world) if name == "camera_from_world" else value)
-        return np.concatenate([old, *(np.asarray(part, old.dtype) for part in new)])
-
-    def _untracked(self, name: str) -> np.ndarray:
-        old = getattr(self.nodes[0], name)
-        return np.concatenate([old, np.zeros((len(self.clip), *old.shape[1:]), old.dtype)])
-
-    def _facts(self, number: int) -> dict[str, Any]:
-        """Return how well the anchors of a window agree, as JSON values."""
-        window, node, world = self.windows[number], self.nodes[number + 1], self.worlds[number + 1]
-        placed = [self.frames[frame] for frame in window.anchors]
-        before = np.concatenate([align(self.nodes[n].camera_from_world[f][None], self.worlds[n]) for n, f in placed])
-        after = align(node.camera_from_world[: len(placed)], world)
-        turned = Rotation.from_matrix(after[:, :, :3] @ before[:, :, :3].swapaxes(1, 2)).magnitude()
-        moved = np.linalg.norm(checked_centres(after) - checked_centres(before), axis=1) / reach_of(self.nodes[0])
-        return {
-            "frames": [window.frames.start, window.frames.stop],
-            "anchors": [self.nodes[n].frame_names[f] for n, f in placed],
-            "degrees": round(float(np.degrees(np.median(turned))), 3),
-            "distance": round(float(np.median(moved)), 4),  # relative to the median depth of the result
-            "residuals": {str(n): round(join.residual, 5) for n, join in window.joins.items()},
-        }
+@contextmanager
+def _kept_windows(out: Path, settings: Mapping[str, Any]) -> Iterator[WindowStore]:
+    """Yield where windows are kept until the result is written, or until the frames turn out not to fit."""
+    is_new = not out.is_dir()
+    with write_errors(out):
+        out.mkdir(parents=True, exist_ok=True)
+    with locked_folder(out / FOLDER, "the windows of a clip"):
+        store = WindowStore(out, settings)
+        try:
+            with kept(lambda: f"{store.count()} windows are kept; the same command goes on from there"):
+                yield store
+        except PlaceError:
+            store.remove()
+            if is_new:
+                with suppress(OSError):
+                    out.rmdir()
+            raise
+        store.remove()
 
 
-def grow(
-    growth: Growth,
-    tools: Tools,
-    windows: Windows,
-    agree: Callable[[Reconstruction, range, Clip], Reconstruction],
-    store: WindowStore | None = None,
-    on_stage: OnStage = no_stage,
+def _agreeing(
+    window: Reconstruction, clip: Clip, anchored: Clip, part: range, old: Reconstruction, options: Options
 ) -> Reconstruction:
-    """Choose anchors, run the windows, join them, and return the joined result."""
-    clip, old = growth.clip, growth.nodes[0]
-    assert windows.window is not None
-    with on_stage("compare frames") as progress:
-        known, columns = _patches(tools, old.images, progress)
-        fresh, _ = _patches(tools, clip.images, progress)
-    places = Places.of(known, columns)
-    length = windows.window - windows.shared
-    parts = [range(start, min(start + length, len(clip))) for start in range(0, len(clip), length)]
-    with on_stage("windows") as progress:
-        for number, part in enumerate(parts, start=1):
-            overlaps = places.overlaps(fresh[part.start : part.stop])
-            anchors = choose_anchors(overlaps, growth.centres, growth.usable, windows.shared)
-            if not anchors:
-                raise InputError(_without_anchor(growth, part, overlaps))
-            anchored, name = growth.anchored(part, anchors), window_name(number)
-            window = None if store is None else store.find(name, anchored.frame_names, _bytes(anchored.images))
-            if window is None:
-                window = agree(tools.run(anchored), part, anchored)
-                if store is not None:
-                    store.save(name, window)
-            growth.add(part, anchors, window)
-            places = places.joined(fresh[part.start : part.stop])
-            if progress is not None:
-                progress(number, len(parts))
-    growth.solve()
-    return growth.result()
+    """Return a window with depth and cameras by the pixels of its new frames and the stored pictures of its anchors.
+
+    One focal length is looked for where the new frames have the size and the scale of the old ones, so that one camera
+    may have taken all; else they stay as predicted.
+    """
+    count = len(anchored) - len(part)
+
+    def pictures() -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+        height, width = (int(side) for side in anchored.source_size[0])
+        for image in bytes_of(anchored.images[:count]):
+            yield np.asarray(Image.fromarray(image).resize((width, height), Image.Resampling.BICUBIC))
+        yield from islice(clip.pictures(), part.start, part.stop)
+
+    is_one_camera = all(
+        len(np.unique(np.concatenate([getattr(old, name), getattr(clip, name)]), axis=0)) == 1
+        for name in ("source_size", "source_scale")
+    )
+    return agree_with_pixels(window, pictures, options, known_intrinsics=not is_one_camera)
 
 
 def _patches(tools: Tools, images: np.ndarray, progress: Progress | None) -> tuple[Float32[np.ndarray, "F N C"], int]:
     """Return the patches of frames, one frame at a time, and how many are in a row."""
-    assert tools.patches is not None
     found, columns = [], 1
     for number, image in enumerate(images, start=1):
         pixels = image / np.float32(255) if image.dtype == np.uint8 else image
@@ -392,38 +298,3 @@ def _patches(tools: Tools, images: np.ndarray, progress: Progress | None) -> tup
         if progress is not None:
             progress(number, len(images))
     return np.stack(found), columns
-
-
-def _without_anchor(growth: Growth, part: range, overlaps: Float64[np.ndarray, "M F"]) -> str:
-    named = f"the new frames {growth.names[part.start]} to {growth.names[part.stop - 1]}"
-    if (best := overlaps.max()) >= LEAST_OVERLAP:
-        return f"{named} overlap only with frames on which everything moves; expected anchors with something at rest"
-    return (
-        f"{named} show another place: they overlap with the known frames by at most {max(best, 0):.2f}, and frames of "
-        f"one place overlap by at least {LEAST_OVERLAP}; reconstruct them on their own, or add frames in between"
-    )
-
-
-def _shows_static(result: Reconstruction) -> Bool[np.ndarray, " S"]:
-    """Return the frames of which enough is known and stands still."""
-    shares = [
-        (show_points(depth, confidence, inside) & ~moving).mean()
-        for depth, confidence, inside, moving in zip(
-            result.depth, result.depth_confidence, result.inside_pictures, result.dynamic_mask, strict=True
-        )
-    ]
-    return np.array(shares) >= _LEAST_STATIC
-
-
-def _times(result: Reconstruction, clip: Clip) -> Float64[np.ndarray, " S"] | None:
-    """Return the times of all frames where both have those of one clock, and the new ones are later; else None."""
-    times = getattr(clip.source, "times", None)
-    first = result.settings.get("first_time")
-    if result.timestamps is None or clip.timestamps is None or times is None or not isinstance(first, float | int):
-        return None
-    new = clip.timestamps + (float(times.first) - first)
-    return np.concatenate([result.timestamps, new]) if new[0] > result.timestamps[-1] else None
-
-
-def _bytes(images: Float32[np.ndarray, "F H W 3"]) -> UInt8[np.ndarray, "F H W 3"]:
-    return np.round(255 * images).astype(np.uint8)

@@ -42,17 +42,14 @@ class Places(NamedTuple):
         floors = [np.where(apart, frame @ frame.T, -1).max(axis=1).mean() for frame in own]
         return cls(mean, own, float(np.median(floors)))
 
-    def joined(self, patches: Float32[np.ndarray, "F N C"]) -> Places:
-        """Return these places with more frames behind them."""
-        return self._replace(patches=np.concatenate([self.patches, _directions(patches, self.mean)]))
-
-    def overlaps(self, patches: Float32[np.ndarray, "M N C"]) -> Float64[np.ndarray, "M F"]:
-        """Return the overlap of new frames with each of these."""
-        alike = [
-            [(frame @ known.T).max(axis=1).mean() for known in self.patches]
-            for frame in _directions(patches, self.mean)
-        ]
-        return (np.array(alike, np.float64).reshape(len(patches), -1) - self.floor) / max(1 - self.floor, 1e-6)
+    def overlaps(
+        self, patches: Float32[np.ndarray, "M N C"], known: Float32[np.ndarray, "K N C"] | None = None
+    ) -> Float64[np.ndarray, "M K"]:
+        """Return the overlap of frames with each of `known`, by default with these frames."""
+        others = self.patches if known is None else _directions(known, self.mean)
+        rows = [[(frame @ other.T).max(axis=1).mean() for other in others] for frame in _directions(patches, self.mean)]
+        alike = np.array(rows, np.float64).reshape(len(patches), len(others))
+        return (alike - self.floor) / max(1 - self.floor, 1e-6)
 
 
 def choose_anchors(
@@ -60,8 +57,9 @@ def choose_anchors(
     centres: Float[np.ndarray, "F 3"],
     usable: Bool[np.ndarray, " F"],
     count: int,
+    bound: float = LEAST_OVERLAP,
 ) -> list[int]:
-    """Return up to `count` frames that show the place of new ones, spread over the path; none where none shows it.
+    """Return up to `count` frames that show the place of new ones, spread over the path.
 
     Each is the one that adds most to the mean overlap of the new frames with their best anchor, and to the spread of
     the anchors. With fewer than three frames that overlap enough, the next best are taken too.
@@ -69,13 +67,12 @@ def choose_anchors(
     Args:
         overlaps: of the new frames with the known ones.
         centres: of the known frames' cameras.
-        usable: known frames that show enough of what does not move.
+        usable: known frames that show enough of what does not move; at least 3.
         count: of anchors, at least 3.
+        bound: frames that overlap by less show another place.
     """
     best = np.where(usable, overlaps.max(axis=0), -np.inf)
-    if best.max(initial=-np.inf) < LEAST_OVERLAP:
-        return []
-    enough = int((best >= LEAST_OVERLAP).sum())
+    enough = int((best >= bound).sum())
     order = np.argsort(-best, kind="stable")
     candidates = order[: min(max(enough, FEWEST_ANCHORS), int(usable.sum()))]
     chosen: list[int] = []
@@ -89,6 +86,14 @@ def choose_anchors(
         chosen.append(int(gain.argmax()))
         covered = np.maximum(covered, overlaps[:, candidates[chosen[-1]]])
     return sorted(int(candidates[number]) for number in chosen)
+
+
+def unconnected(placed: Bool[np.ndarray, " M"], alike: Bool[np.ndarray, "M M"]) -> list[int]:
+    """Return the frames that are neither placed nor lead to placed ones over frames that show one place."""
+    reached = placed
+    while (more := reached | alike[:, reached].any(axis=1)).sum() > reached.sum():
+        reached = more
+    return np.flatnonzero(~reached).tolist()
 
 
 def _directions(patches: Float32[np.ndarray, "F N C"], mean: Float32[np.ndarray, " C"]) -> Float32[np.ndarray, "F N C"]:

@@ -68,7 +68,7 @@ class Tools(NamedTuple):
 
     run: Callable[[Clip], Reconstruction]
     describe: Callable[[Float32[np.ndarray, "F H W 3"]], Float32[np.ndarray, "F C"]]  # features for finding loops
-    patches: Callable[[Float32[np.ndarray, "F H W 3"]], tuple[Float32[np.ndarray, "F N C"], int]] | None = None
+    patches: Callable[[Float32[np.ndarray, "F H W 3"]], tuple[Float32[np.ndarray, "F N C"], int]]  # by `thinned`
     follow: Follow | None = None
     check_track_size: Callable[[int, int], None] = lambda height, width: None  # raises InputError for small frames
 
@@ -157,13 +157,14 @@ def tools_of(
     *,
     fusion: FusionParams | None = None,
     masks: str | Path | Literal[False] | None = None,
+    pad_frames: bool = False,
 ) -> Tools:
     """Return what runs a window by `reconstruct`, and describes frames by the means of their patch tokens."""
     config = model.config
 
     def run(clip: Clip) -> Reconstruction:
         moving = load_masks(str(masks), clip) if isinstance(masks, str | Path) else masks
-        running = Running(is_part=True)
+        running = Running(is_part=True, pad_frames=pad_frames)
         return reconstruct(model, clip, options=options, running=running, size=size, masks=moving, fusion=fusion)
 
     execute, compute = Execute(), compute_by(options)

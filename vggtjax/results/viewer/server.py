@@ -5,11 +5,20 @@ from __future__ import annotations
 import secrets
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import NamedTuple
 from urllib.parse import urlsplit
 
 from vggtjax.results.viewer.access import Access, listening, token_for
 
+_MARK, _ASKS_NOBODY = '<meta name="page" content="">', "default-src 'none';"  # in client/page.html
 _SILENCE = 30  # seconds after which a connection that says nothing is closed
+
+
+class Shown(NamedTuple):
+    """A page, and the tag that tells it from others."""
+
+    page: bytes
+    tag: str
 
 
 class PageServer(ThreadingHTTPServer):
@@ -39,8 +48,11 @@ class PageServer(ThreadingHTTPServer):
         self.access = Access(host, self.server_port, token_for(host))
 
     def show(self, page: str) -> None:
-        """Serve another page from now on; an open browser asks for its tag every few seconds, and loads it anew."""
-        self.page, self.tag = page.encode(), f'"{secrets.token_hex(8)}"'
+        """Serve another page from now on. An open one asks for the tag every few seconds, and is then loaded anew."""
+        tag = secrets.token_hex(8)
+        page = page.replace(_MARK, _MARK.replace('""', f'"{tag}"'), 1)
+        page = page.replace(_ASKS_NOBODY, f"{_ASKS_NOBODY} connect-src 'self';", 1)
+        self.shown = Shown(page.encode(), f'"{tag}"')
 
     def handle_error(self, request: object, client_address: object) -> None:
         """Say nothing of a browser that hangs up."""
@@ -62,7 +74,8 @@ class _Handler(BaseHTTPRequestHandler):
         elif admitted == "enter":
             self._answer(HTTPStatus.SEE_OTHER, b"", **{"Location": ".", "Set-Cookie": access.cookie})
         else:
-            self._answer(HTTPStatus.OK, self.server.page, "text/html", ETag=self.server.tag)
+            shown = self.server.shown
+            self._answer(HTTPStatus.OK, shown.page, "text/html", ETag=shown.tag)
 
     do_HEAD = do_GET  # noqa: N815 - http.server's name
 

@@ -16,19 +16,17 @@ async function main() {
   }
 }
 
-// Loads the page anew when the server has another one, as of a result that grows.
-async function watch(seconds) {
-  let known = null;
+// Loads the page anew when its server shows another one, as of a result that has grown; exported pages have no tag.
+async function watch(tag, seconds) {
   for (;;) {
-    try {
-      const tag = (await fetch(location.href, { method: "HEAD" })).headers.get("ETag");
-      if (tag === null) return;
-      if (known !== null && tag !== known) location.reload();
-      known = tag;
-    } catch {}  // the server has ended, or starts again
     await new Promise((resolve) => setTimeout(resolve, 1000 * seconds));
+    try {
+      const answer = await fetch(location.href, { method: "HEAD" });
+      if (answer.ok && answer.headers.get("ETag") !== `"${tag}"`) location.reload();
+    } catch {}  // the server has ended; it may start again
   }
 }
 
 main();
-if (location.protocol.startsWith("http")) watch(3);
+const page = document.querySelector('meta[name="page"]').content;
+if (page) watch(page, 3);
