@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 from collections.abc import Callable
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, UInt8
@@ -17,13 +18,14 @@ from vggtjax.research.evaluation.metrics.depth import depth_errors, measured, me
 from vggtjax.research.evaluation.metrics.trajectory import centre_error, rotation_error
 from vggtjax.training.scenes import SceneConfig, held_out_scenes
 
-Image, Mask = UInt8[np.ndarray, "H W 3"], Bool[np.ndarray, "H W"]
+Image: TypeAlias = UInt8[np.ndarray, "H W 3"]
+Mask: TypeAlias = Bool[np.ndarray, "H W"]
 _METRICS = ("rotation (deg)", "centres", "AbsRel static")
 _AROUND = 5  # pixels around a hole that OpenCV looks at
 
 
 def _inpainted(image: Image, mask: Mask) -> Image:
-    import cv2
+    import cv2  # pyright: ignore[reportMissingImports]
 
     return cv2.inpaint(np.ascontiguousarray(image), mask.astype(np.uint8), _AROUND, cv2.INPAINT_TELEA)
 
@@ -57,7 +59,7 @@ def masked_pixels(*, model: str = "demo", clips: int = 64, frames: int = 12, sid
     if clips < 2:
         raise InputError(f"clips is {clips}; expected at least 2")
     try:
-        import cv2  # noqa: F401
+        import cv2  # noqa: F401 # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise InputError("inpainting needs OpenCV: pip install opencv-python-headless") from error
     logging.disable(logging.WARNING)

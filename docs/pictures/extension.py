@@ -41,17 +41,14 @@ def grown(model: Model, scene: int, seed: int, frames: int, side: int) -> Figure
         "of the result": (centres[:half], _OLD),
         "of the new frames": (centres[half:], _NEW),
     }
-    for column, title in enumerate(("the joined result from above", "its cameras, enlarged")):
-        axes = figure.add_subplot(grid[0, 4 * column : 4 * column + 4])
-        if column == 0:
-            _points(axes, both, world)
+    above, enlarged = (figure.add_subplot(grid[0, 4 * column : 4 * column + 4]) for column in range(2))
+    _points(above, both, world)
+    for axes, title, size in ((above, "the joined result from above", 3), (enlarged, "its cameras, enlarged", 5)):
         for name, (path, colour) in paths.items():
-            axes.plot(
-                path[:, 0], path[:, 2], "o-", color=colour, label=name, markersize=2.5 * (1 + column), linewidth=1
-            )
+            axes.plot(path[:, 0], path[:, 2], "o-", color=colour, label=name, markersize=size, linewidth=1)
         axes.set(title=title, xlabel="x, metres", ylabel="z, metres")
         axes.set_aspect("equal", "datalim")
-    axes.legend()
+    enlarged.legend()
     for place, frame in enumerate(np.linspace(0, frames - 1, 8).round().astype(int)):
         axes = figure.add_subplot(grid[1, place])
         axes.set(xticks=[], yticks=[])

@@ -128,7 +128,7 @@ def test_a_folder_that_fills_is_watched_until_ctrl_c(result, pictures, tmp_path,
 
     monkeypatch.setattr(command.time, "sleep", sleep)
     fitter = fitter_of(old)
-    both = command._watched(folder, old, grown, fitter, "x_", Report())
+    both = command._watched(folder, old, grown, fitter, "x_", Report())  # pyright: ignore[reportArgumentType]
     assert calls == [["000005", "000006"], ["000005"], ["000006", "later"]]
     assert both.frame_names[len(OLD) :] == ("x_000005", "x_000006", "x_later")
     said = " ".join(capsys.readouterr().err.split())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -83,7 +83,7 @@ def extend(
             old = Reconstruction.load(result)
         check_folder(out, saving.names(tracks=old.track_frames is not None))
         options, fitter = extending.options_of(old), extending.fitter_of(old)
-        source = None if watch else open_source(clip[0] if len(clip) == 1 else list(clip))
+        source = list(clip) if watch else open_source(clip[0] if len(clip) == 1 else list(clip))
         model, fusion = files.load(report, options, [options.method])
         extending.check_result(model, old)
 
@@ -102,7 +102,7 @@ def extend(
         report.summary(both, out, model)
 
 
-def _check_watch(clip: tuple[str, ...], sampling: Sampling) -> None:
+def _check_watch(clip: Sequence[str], sampling: Sampling) -> None:
     if len(clip) > 1 or not Path(clip[0]).is_dir():
         raise InputError(f"--watch is for one folder that fills with pictures; {clip[-1]} is none, or one too many")
     if sampling != Sampling():

@@ -187,9 +187,9 @@ def options_of(result: Reconstruction) -> Options:
     row = METHODS[result.method]
     defaults = {"threshold": row.threshold, "mask": row.mask}  # absent from settings where they are the method's own
     names = {field.name for field in dataclasses.fields(Options)} - {"method", "refine_cameras"}
-    given = defaults | {name: result.settings[name] for name in names & result.settings.keys()}
+    given: dict[str, Any] = defaults | {name: result.settings[name] for name in names & result.settings.keys()}
     try:
-        return Options(result.method, **given)
+        return Options(**given, method=result.method)  # pyright: ignore[reportArgumentType] - a text, and checked
     except InputError as error:
         raise InputError(f"the settings of the result cannot be taken over: {error}") from error
 
