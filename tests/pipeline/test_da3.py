@@ -49,8 +49,20 @@ def test_the_world_is_the_first_camera(result):
     assert np.abs(result.camera_from_world[1] - np.eye(4)[:3]).max() > 1e-2
 
 
+def test_the_reference_frame_is_told(model, clip, result):
+    chosen = clip.frame_names.index(result.settings["reference_frame"])
+    assert chosen > 0  # so that it differs from the first
+    for reference, number in (("first", 0), ("middle", 2)):
+        other = reconstruct(model, clip, size=70, reference=reference)
+        assert other.settings["reference_frame"] == clip.frame_names[number]
+        assert np.abs(other.depth - result.depth).max() > 1e-3
+    moved = reconstruct(model, clip, size=70, attention="sampled")
+    assert moved.settings["reference_frame"] == clip.frame_names[0]
+
+
 def test_padded_frames_change_nothing(model, clip, result):
     padded = reconstruct(model, clip, size=70, pad_frames=True)
+    assert padded.settings["reference_frame"] == result.settings["reference_frame"]
     np.testing.assert_allclose(padded.camera_from_world, result.camera_from_world, atol=1e-4)
     np.testing.assert_allclose(padded.depth, result.depth, rtol=2e-3)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple, Protocol
@@ -244,8 +243,6 @@ class Aggregator(nn.Module):
             special = jnp.concatenate([special, registers], axis=1)  # [2, 1 + R, C]
         is_other = jnp.asarray(frames.numbers(S) > 0)
         if features.class_tokens is not None:
-            if compute.attention == "sampled":  # which sees the whole first frame
-                compute = dataclasses.replace(compute, reference="first")
             reference = reference_frame(features.class_tokens, real, compute)
             is_other = frames.numbers(S)[None] != reference[:, None]  # [B, S]
         special = special.astype(patches.dtype)[is_other.astype(int)]  # [(B,) S, 1 + R, C]
@@ -258,8 +255,9 @@ class Aggregator(nn.Module):
 def reference_frame(
     class_tokens: Float[Array, "B S C"], real: Bool[Array, "B S"] | None = None, compute: Compute = Compute()
 ) -> Int[Array, " B"]:
-    """Return the number of each clip's reference frame by `compute.reference`; 0 in clips of one or two frames.
+    """Return the number of each clip's reference frame by `compute.reference`.
 
+    It is 0 in clips of one or two frames, and with sampled attention, which sees the whole first frame.
     "chosen" is the most ordinary frame (Depth Anything 3, "saddle_balanced"). Three facts of a class token count, each
     scaled to [0, 1] over the clip: its mean similarity to the others, its norm, and the variance of its unit vector.
     The frame whose facts are closest to 0.5 is chosen.
@@ -279,7 +277,7 @@ def reference_frame(
         "chosen": jnp.argmin(jnp.where(real, distance, jnp.inf), axis=-1),
         "first": jnp.zeros_like(count),
         "middle": count // 2,
-    }[compute.reference]
+    }["first" if compute.attention == "sampled" else compute.reference]
     return jnp.where(count < 3, 0, number)
 
 

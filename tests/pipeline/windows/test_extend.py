@@ -8,6 +8,7 @@ import pytest
 
 from tests.pipeline.windows import walk as walks
 from tests.pipeline.windows.walk import CONFIG, FRAMES, movers, walk, window_result
+from tests.shared.contents import contents
 from vggtjax.cameras import checked_centres, umeyama_sim3, unproject
 from vggtjax.clips.clip import read_clip
 from vggtjax.clips.media.sampling import Sampling
@@ -18,7 +19,9 @@ from vggtjax.pipeline.windows import extend as extending
 from vggtjax.pipeline.windows.extend import Extending, grown, options_of
 from vggtjax.pipeline.windows.growth import PlaceError
 from vggtjax.pipeline.windows.overlap import Places, choose_anchors, thinned
+from vggtjax.pipeline.windows.run import run_windows
 from vggtjax.pipeline.windows.store import WindowStore
+from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.result import ARRAYS
 
 NOTHING = np.zeros((FRAMES, CONFIG.height, CONFIG.width), bool)
@@ -86,6 +89,18 @@ def test_exact_windows_continue_a_result_exactly_and_its_frames_stay(backwards):
     joins = [set(window["residuals"]) for window in facts["windows"]]
     assert sum("0" in nodes for nodes in joins) >= 2  # the walk comes back to the result: a loop is closed
     assert any(len(nodes) > 1 for nodes in joins)
+
+
+def test_a_result_of_windows_in_metres_grows(tmp_path):
+    """Its arrays are mapped files, of which nothing is written to."""
+    tools = walks.tools_of(exact)._replace(patches=features)
+    run_windows(np.asarray(walk().images)[:40], tmp_path, walks.windows_of(), walks.plan_of(), tools, walks.SETTINGS)
+    before, result = contents(tmp_path), Reconstruction.load(tmp_path)
+    result = dataclasses.replace(result, settings=result.settings | {"known": {"lengths": "metre"}})
+    both = joined(result, part_of_walk(slice(40, None)), exact)
+    assert error_of(both, slice(None)) < 1e-5
+    assert both.length_unit == "metre"
+    assert contents(tmp_path) == before
 
 
 def test_a_stopped_run_goes_on(tmp_path):
