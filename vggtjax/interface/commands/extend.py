@@ -13,7 +13,7 @@ import tyro
 from vggtjax.clips.media.sampling import Sampling
 from vggtjax.errors import InputError
 from vggtjax.interface.commands.arguments import ResultFolder, ResultPath
-from vggtjax.interface.commands.flags import InWords, Switch
+from vggtjax.interface.commands.flags import Switch
 from vggtjax.interface.commands.models import ModelFiles
 from vggtjax.interface.commands.report import Report
 from vggtjax.results.saving import Saving
@@ -38,7 +38,7 @@ def extend(
     sampling: Annotated[Sampling, tyro.conf.arg(name="input", help="")] = Sampling(),
     saving: Annotated[Saving, tyro.conf.arg(name="output", help="")] = Saving(),
     out: ResultFolder,
-    prefix: InWords[str] = "",
+    prefix: Annotated[str, tyro.conf.arg(metavar="LETTERS", help_behavior_hint="")] = "",
     window: int = 32,
     anchors: int = 8,
     least_overlap: float = 0.4,
