@@ -11,9 +11,9 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from vggtjax.clips.fingerprint import file_digest
 from vggtjax.errors import CheckpointError
 from vggtjax.storage.cache import cache_folder
+from vggtjax.storage.file_digest import file_digest
 from vggtjax.storage.json_values import read_json
 from vggtjax.storage.writing import writing
 

@@ -116,7 +116,13 @@ def test_mask_refinement():
     pixels, points = (FRAMES, *SIZE), (FRAMES, 50)
     lowered(cluster_points, shapes(jax.random.key(0)), array(*points, 3), array(*points, dtype=bool))
     arrays = (array(*pixels, 3), array(*pixels), array(*pixels, dtype=bool), array(FRAMES, 3, 4), array(FRAMES, 3, 3))
-    lowered(cluster_losses, *arrays, array(*points, dtype=int), array(*points, dtype=bool), array(*points, dtype=int))
+    lowered(
+        cluster_losses,
+        *arrays,
+        array(*points, dtype=np.int32),
+        array(*points, dtype=bool),
+        array(*points, dtype=np.int32),
+    )
 
 
 def test_the_gradient_of_the_blocks():

@@ -1,9 +1,8 @@
-"""What tells whether files, or the frames of a source, have changed since they were used. Does not import jax."""
+"""What tells whether the frames of a source have changed since a result was made of them. Does not import jax."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
@@ -43,12 +42,3 @@ def fingerprint(source: Source) -> str | None:
 def source_setting(source: Source) -> dict[str, str]:
     """Return the fingerprint of a source as a setting of its result; none where it has no fingerprint."""
     return {} if (known := fingerprint(source)) is None else {"source": known}
-
-
-def file_digest(paths: Iterable[Path]) -> str:
-    """Return a digest of names, sizes and dates of files, which are not read; raises OSError for a missing one."""
-    digest = hashlib.sha256()
-    for path in paths:
-        stat = path.stat()
-        digest.update(f"{path} {stat.st_size} {stat.st_mtime_ns}\n".encode("utf-8", "surrogateescape"))
-    return digest.hexdigest()

@@ -18,7 +18,6 @@ from PIL import Image, ImageOps
 from vggtjax.clips.captures.frames import CaptureFrames
 from vggtjax.clips.captures.lens import Undistortion
 from vggtjax.clips.clip import Clip
-from vggtjax.clips.fingerprint import file_digest
 from vggtjax.clips.media.images import (
     UNREADABLE,
     ImageFiles,
@@ -33,6 +32,7 @@ from vggtjax.clips.media.video import VideoFile
 from vggtjax.clips.sources import open_source
 from vggtjax.clips.truth import at_clip_pixels
 from vggtjax.errors import ClipError, InputError, reading
+from vggtjax.storage.file_digest import file_digest
 
 logger = logging.getLogger(__name__)
 

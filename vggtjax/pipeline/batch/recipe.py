@@ -13,7 +13,6 @@ from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
 
-from vggtjax.clips.fingerprint import file_digest
 from vggtjax.clips.masks import masks_digest
 from vggtjax.clips.media.sampling import Sampling
 from vggtjax.clips.preprocessing import Framing
@@ -23,6 +22,7 @@ from vggtjax.pipeline.batch.destination import PAGE_NAME, SETTINGS_NAME
 from vggtjax.pipeline.known.options import KnownGeometry
 from vggtjax.progress import Progress
 from vggtjax.results.saving import Saving
+from vggtjax.storage.file_digest import file_digest
 
 CHANGED = "its source has changed since the earlier result"
 _TAKEN = ("", "..", SETTINGS_NAME, PAGE_NAME)

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vggtjax.clips.captures.pictures import picture_size
-from vggtjax.clips.fingerprint import file_digest
 from vggtjax.clips.preprocessing import Framing
 from vggtjax.errors import InputError
 from vggtjax.options import METHODS, Options
@@ -19,6 +18,7 @@ from vggtjax.research.evaluation.foreign_frames import placed
 from vggtjax.research.evaluation.records import shown_name
 from vggtjax.results.foreign import check_format, needs_quaternion
 from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.storage.file_digest import file_digest
 from vggtjax.storage.trajectories import Quaternion
 
 if TYPE_CHECKING:  # the folders of other programs are scored without jax
