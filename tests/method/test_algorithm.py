@@ -164,11 +164,12 @@ def test_soft_masks_of_any_caller_are_those_of_the_soft_method(model):
     masking = soft_masking(model.config, temperature=0.1)
     soft = jax.jit(reconstruct_soft, static_argnames="config")(model.params, images, model.config, masking)
     made, passes = infer(model.params, images, model.config, masks=masking)
-    # Two programs round differently: saliencies differ by 3e-4, as rounding grows in the product of the five maps, and
-    # a temperature of 0.1 makes ten times as much of it.
-    assert np.allclose(passes.dynamic_mask, soft.passes.dynamic_mask, atol=1e-2)
-    shares = soft_pixels(passes.saliency, masking, size=(SIDE, SIDE), threshold="otsu")
-    assert np.allclose(passes.dynamic_mask, shares, atol=1e-5)
+    # Two programs round differently, which grows in the product of the five maps, most where a map hardly varies.
+    assert np.allclose(passes.first.depth, soft.passes.first.depth, rtol=1e-5)
+    assert np.abs(passes.saliency - soft.passes.saliency).mean() < 5e-3
+    for found in (passes, soft.passes):
+        shares = soft_pixels(found.saliency, masking, size=(SIDE, SIDE), threshold="otsu")
+        assert np.allclose(found.dynamic_mask, shares, atol=1e-5)
     assert np.allclose(made.depth, fuse(paper_rule(), observe(passes)).depth, rtol=1e-5)
 
     def depth(masking, method):
