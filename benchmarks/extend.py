@@ -14,8 +14,10 @@ from vggtjax.errors import InputError
 from vggtjax.options import Options
 from vggtjax.pipeline.pretrained.load import load_model
 from vggtjax.pipeline.run import reconstruct
-from vggtjax.pipeline.windows.extend import Extending
 from vggtjax.pipeline.windows.extend import extend as extended
+from vggtjax.pipeline.windows.overlap import Places
+from vggtjax.pipeline.windows.plan import Extending
+from vggtjax.pipeline.windows.run import tools_of
 from vggtjax.training.scenes import SceneConfig, held_out_scenes
 
 _SHARED = 4  # frames that the two runs share, whose cameras join them
@@ -39,6 +41,8 @@ def extend(*, model: str = "demo", clips: int = 16, frames: int = 24, side: int 
     network, half = load_model(model), frames // 2
     scenes = held_out_scenes("dynamic", clips, SceneConfig(height=side, width=side, frames=frames), seed=seed)
     images, options, errors, refused = np.round(255 * scenes.images).astype(np.uint8), Options(), [], 0
+    patches = tools_of(network).patches
+    own, others = [], []  # the largest overlap of a frame of the second half, and of one of another scene
     how = Extending(prefix="new_")
     for number in range(clips):
         truth = Truth(*(np.asarray(getattr(scenes, name))[number] for name in Truth._fields))
@@ -55,6 +59,10 @@ def extend(*, model: str = "demo", clips: int = 16, frames: int = 24, side: int 
         errors.append(
             [_path_error(poses, truth) for poses in (whole.camera_from_world, both.camera_from_world, by_cameras)]
         )
+        known, columns = patches(first.images / np.float32(255))
+        for found, scene in ((own, number), (others, (number + 1) % clips)):
+            new, _ = patches(images[scene][half:] / np.float32(255))
+            found.append(Places.of(known, columns).overlaps(new).max())
         try:
             extended(network, first, images[(number + 1) % clips][half:], extending=how, options=options)
         except InputError:
@@ -64,7 +72,9 @@ def extend(*, model: str = "demo", clips: int = 16, frames: int = 24, side: int 
     names = ("one run over all frames", "extend", f"two runs joined by {_SHARED} cameras")
     rows = [f"| {name} | {mean:.4f} | {mean / means[0]:.2f} |" for name, mean in zip(names, means, strict=True)]
     table = ["| path error, median depths | mean | compared with one run |", "|---|---|---|", *rows]
-    sys.stdout.write("\n".join([*table, "", f"{refused} of {clips} clips of another scene are refused", ""]))
+    told = f"{refused} of {clips} clips of another scene are refused; the best overlap of a clip is at least "
+    told += f"{min(own):.2f} in its own scene, and at most {max(others):.2f} in another"
+    sys.stdout.write("\n".join([*table, "", told, ""]))
 
 
 def _path_error(camera_from_world: Float[np.ndarray, "S 3 4"], truth: Truth) -> float:

@@ -34,3 +34,13 @@ class StageSeconds:
         started = time.perf_counter()
         yield
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - started
+
+    def telling(self, on_stage: OnStage) -> OnStage:
+        """Return an `OnStage` that times its stages and tells `on_stage` of them."""
+
+        @contextmanager
+        def stage(name: str) -> Iterator[Progress | None]:
+            with self.stage(name), on_stage(name) as progress:
+                yield progress
+
+        return stage

@@ -22,7 +22,7 @@ def grown(model: Model, scene: int, seed: int, frames: int, side: int) -> Figure
 
     import vggtjax
     from vggtjax.cameras import checked_centres, umeyama_sim3
-    from vggtjax.pipeline.windows.extend import Extending
+    from vggtjax.pipeline.windows.plan import Extending
     from vggtjax.training.scenes.config import SceneConfig
     from vggtjax.training.scenes.held_out import held_out_scenes
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -17,10 +18,14 @@ from vggtjax.clips.shots import looks_of
 from vggtjax.method.assembly import Assembly, FusionRule
 from vggtjax.method.fusion.file import fusion_digest
 from vggtjax.method.passes import Passes
+from vggtjax.network.aggregator import reference_frame
+from vggtjax.network.backbone import Features
 from vggtjax.network.checkpoint import Model
 from vggtjax.network.heads.track_head import Tracks
 from vggtjax.network.model import Predictions
+from vggtjax.network.precision import Compute
 from vggtjax.options import Options
+from vggtjax.pipeline.devices import on_host
 from vggtjax.results.report import versions
 
 _MATCHED = "mined: matches between frames and Gram similarities"
@@ -99,6 +104,15 @@ def settings_of(
     if isinstance(clip.source, CaptureFrames) and clip.source.lenses_undone:
         settings["undistorted"] = clip.source.lenses_undone
     return settings | ({"model_note": model.note} if model.note else {}) | {"versions": versions()}
+
+
+def reference_setting(features: Features | None, clip: Clip, options: Options) -> dict[str, str]:
+    """Return the name of the frame that the network looked at first, as a setting; none of a family with no choice."""
+    if features is None or features.class_tokens is None:
+        return {}
+    tokens = jnp.asarray(on_host(features.class_tokens)[:, : len(clip.images)])
+    number = reference_frame(tokens, compute=Compute(reference=options.reference, attention=options.attention))
+    return {"reference_frame": clip.frame_names[int(number[0])]}
 
 
 def kept_passes(passes: Passes) -> Passes:

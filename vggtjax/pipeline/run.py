@@ -22,12 +22,9 @@ from vggtjax.method.algorithm import Clips, compute_by, run_method
 from vggtjax.method.assembly import Assembly, FusionRule, as_tree, check_fuses
 from vggtjax.method.mask_refinement import refine_masks
 from vggtjax.method.passes import Passes
-from vggtjax.network.aggregator import reference_frame
-from vggtjax.network.backbone import Features
 from vggtjax.network.checkpoint import Model, check_finite
 from vggtjax.network.heads.pose import encode_pose
 from vggtjax.network.kernels.frames import BY_FRAME, REPLICATED, Frames
-from vggtjax.network.precision import Compute
 from vggtjax.network.surroundings import own_settings
 from vggtjax.options import Options
 from vggtjax.pipeline.agreement import agree_with_pixels, agrees_with_pixels
@@ -37,6 +34,7 @@ from vggtjax.pipeline.fields import (
     clip_fields,
     kept_passes,
     motion_by_matches,
+    reference_setting,
     settings_of,
     track_fields,
 )
@@ -120,12 +118,12 @@ def reconstruct(
             compiler.wait(progress)
         hint_compilation_cache(time.perf_counter() - started)
         outputs = run(step=Execute(running.stage))
-        reference = None if cameras is not None else _reference(outputs[1].features, inputs.clip, options)
+        reference = {} if cameras is not None else reference_setting(outputs[1].features, inputs.clip, options)
         outputs = _on_host(outputs, len(inputs.clip.images))
         del run  # with its arrays on the devices
 
     result = _result(model, inputs, cameras is not None, options, running, fusion, outputs)
-    result = dataclasses.replace(result, settings=result.settings | (reference or {}))
+    result = dataclasses.replace(result, settings=result.settings | reference)
     warn_of_not_finite(result)
     result, unit = _with_geometry(result, inputs, options, running.stage)
     if options.refine_mask and result.has_mask:
@@ -268,15 +266,6 @@ def read_cameras(model: Model, inputs: Inputs) -> Float32[np.ndarray, "S 9"] | N
         return None
     poses = world_from_camera(np.asarray(given.poses)[:, :3])[:, :3]
     return np.asarray(encode_pose(jnp.asarray(poses), jnp.asarray(given.intrinsics), (height, width)), np.float32)
-
-
-def _reference(features: Features | None, clip: Clip, options: Options) -> dict[str, str] | None:
-    """Return the name of the frame that the network looked at first, as a setting; None of a family with no choice."""
-    if features is None or features.class_tokens is None:
-        return None
-    tokens = jnp.asarray(on_host(features.class_tokens)[:, : len(clip.images)])
-    number = reference_frame(tokens, compute=Compute(reference=options.reference, attention=options.attention))
-    return {"reference_frame": clip.frame_names[int(number[0])]}
 
 
 def _on_host(outputs: tuple[Assembly, Passes], frames: int) -> tuple[Assembly, Passes]:

@@ -1,5 +1,6 @@
 """vggtjax extend: a result of the embedded model grows; what does not fit is refused and nothing is written."""
 
+import dataclasses
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -74,6 +75,7 @@ def test_what_does_not_fit_is_refused_and_nothing_is_written(result, pictures, t
         ((noise, "--out", out, "--anchors", 2), "--anchors is 2"),
         ((noise / "000100.png", "--out", out, "--watch"), "one folder that fills with pictures"),
         ((noise, "--out", out, "--watch", "--stride", 2), "--watch takes every picture that comes"),
+        ((noise, "--out", out, "--least-overlap", 1.5), "--least-overlap is 1.5; expected a number between 0 and 1"),
         ((), "required"),
     ):
         try:
@@ -84,6 +86,11 @@ def test_what_does_not_fit_is_refused_and_nothing_is_written(result, pictures, t
         assert sentence in said
         assert not out.exists()
     assert contents(result) == before
+    foreign = dataclasses.replace(Reconstruction.load(result), method="monst3r")
+    foreign.save(tmp_path / "foreign", only=("cameras",))
+    code, said = extended(capsys, tmp_path / "foreign", noise, "--out", out)
+    assert (code, out.exists()) == (2, False)
+    assert "the result is of monst3r; expected one that vggtjax made" in said
 
 
 def test_a_kill_while_writing_loses_no_window(result, pictures, tmp_path, monkeypatch, capsys):

@@ -16,9 +16,10 @@ from vggtjax.clips.sources import open_source
 from vggtjax.errors import InputError
 from vggtjax.options import Options
 from vggtjax.pipeline.windows import extend as extending
-from vggtjax.pipeline.windows.extend import Extending, grown, options_of
+from vggtjax.pipeline.windows.extend import grow, options_of
 from vggtjax.pipeline.windows.growth import PlaceError
 from vggtjax.pipeline.windows.overlap import Places, choose_anchors, thinned
+from vggtjax.pipeline.windows.plan import Extending
 from vggtjax.pipeline.windows.run import run_windows
 from vggtjax.pipeline.windows.store import WindowStore
 from vggtjax.results.reconstruction import Reconstruction
@@ -55,7 +56,7 @@ def features(images):
 
 def joined(result, clip, run, store=None):
     tools = walks.tools_of(run)._replace(patches=features)
-    return grown(result, clip, list(clip.frame_names), tools, HOW, Options(), store)
+    return grow(result, clip, list(clip.frame_names), tools, HOW, Options(), store)
 
 
 def exact(clip):
@@ -127,7 +128,7 @@ def test_frames_that_lead_to_the_place_are_run_first():
     bound = float(np.sort(overlaps)[-12])  # the part in the middle shows nothing that the result shows
     tools = walks.tools_of(exact)._replace(patches=features)
     how = Extending(window=16, anchors=4, least_overlap=bound)
-    both = grown(result, new, list(new.frame_names), tools, how, Options())
+    both = grow(result, new, list(new.frame_names), tools, how, Options())
     assert error_of(both, [int(name) for name in both.frame_names]) < 1e-5
 
 

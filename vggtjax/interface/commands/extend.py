@@ -16,6 +16,7 @@ from vggtjax.interface.commands.arguments import ResultFolder, ResultPath
 from vggtjax.interface.commands.flags import Switch
 from vggtjax.interface.commands.models import ModelFiles
 from vggtjax.interface.commands.report import Report
+from vggtjax.pipeline.windows.plan import Extending
 from vggtjax.results.saving import Saving
 from vggtjax.storage.interruption import handled
 
@@ -38,10 +39,7 @@ def extend(
     sampling: Annotated[Sampling, tyro.conf.arg(name="input", help="")] = Sampling(),
     saving: Annotated[Saving, tyro.conf.arg(name="output", help="")] = Saving(),
     out: ResultFolder,
-    prefix: Annotated[str, tyro.conf.arg(metavar="LETTERS", help_behavior_hint="")] = "",
-    window: int = 32,
-    anchors: int = 8,
-    least_overlap: float = 0.4,
+    extending: Annotated[Extending, tyro.conf.arg(name="windows", help="")] = Extending(),
     watch: Switch = False,
 ) -> None:
     """Add frames of the same place to a finished result, in its frame and scale.
@@ -56,10 +54,7 @@ def extend(
         sampling: which frames are taken
         saving: what is written
         out: folder for the new result
-        prefix: letters before the names of the new frames, such as day2_, where they have names of old ones.
-        window: frames that are run together, anchors and new ones.
-        anchors: how many of them are frames that are known already, at least 3.
-        least_overlap: frames that overlap by less, from 0 to 1, show another place.
+        extending: how the new frames are named, run and joined
         watch: CLIP is a folder that still fills, such as that of a capture that is running: add pictures as they come,
             until Ctrl-C. vggtjax view OUT shows the growing scene.
     """
@@ -73,29 +68,30 @@ def extend(
     with report.running():
         from vggtjax.clips.clip import read_clip
         from vggtjax.clips.sources import open_source
-        from vggtjax.pipeline.windows import extend as extending
+        from vggtjax.pipeline.windows import extend as extension
         from vggtjax.pipeline.windows.store import discard
         from vggtjax.results.folder import check_folder
         from vggtjax.results.reconstruction import Reconstruction
 
-        how = extending.Extending(prefix, window, anchors, least_overlap)
         with report.stage("read"):
             old = Reconstruction.load(result)
         check_folder(out, saving.names(tracks=old.track_frames is not None))
-        options, fitter = extending.options_of(old), extending.fitter_of(old)
+        options, fitter = extension.options_of(old), extension.fitter_of(old)
         source = list(clip) if watch else open_source(clip[0] if len(clip) == 1 else list(clip))
         model, fusion = files.load(report, options, [options.method])
-        extending.check_result(model, old)
+        extension.check_result(model, old)
 
         def grown(old: Reconstruction, new: ClipSource, which: Sampling = Sampling()) -> Reconstruction:
             with report.stage("load clip") as progress:
                 frames = read_clip(open_source(new), which, fitter, progress)
-            given = {"extending": how, "options": options, "fusion": fusion, "saving": saving}
-            return extending.extend(model, old, frames, out=out, on_stage=report.stage, **given)
+            given = {"extending": extending, "options": options, "fusion": fusion, "saving": saving}
+            return extension.extend(model, old, frames, out=out, on_stage=report.stage, **given)
 
-        both = _watched(Path(clip[0]), old, grown, fitter, prefix, report) if watch else grown(old, source, sampling)
         if watch:
+            both = _watched(Path(clip[0]), old, grown, fitter, extending.prefix, report)
             discard(out)
+        else:
+            both = grown(old, source, sampling)
     if both is old:
         report.line("No picture was added.")
     else:
@@ -104,7 +100,7 @@ def extend(
 
 def _check_watch(clip: Sequence[str], sampling: Sampling) -> None:
     if len(clip) > 1 or not Path(clip[0]).is_dir():
-        raise InputError(f"--watch is for one folder that fills with pictures; {clip[-1]} is none, or one too many")
+        raise InputError(f"--watch is for one folder that fills with pictures, and {' '.join(clip)} is given")
     if sampling != Sampling():
         raise InputError("--watch takes every picture that comes; leave out --start, --stride, --fps and the like")
 

@@ -24,6 +24,7 @@ from vggtjax.options import Options
 from vggtjax.pipeline.batch.cluster import Cluster
 from vggtjax.pipeline.batch.recipe import BatchRecipe, ClipRecipe
 from vggtjax.pipeline.known.options import KnownGeometry
+from vggtjax.pipeline.windows.plan import Extending
 from vggtjax.results.saving import GROUPS, Saving, parse_groups
 
 T = TypeVar("T")
@@ -126,6 +127,7 @@ _FIELDS: dict[type, dict[str, Look]] = {
         "baseline": _in_words("I,J,METRES"),
         "known_depths": _DEPTHS,
     },
+    Extending: {"prefix": _in_words("LETTERS")},
     Saving: {"only": lambda hint: InWords[Annotated[hint, _GROUPS]]},
     Cluster: {"address": _in_words("HOST:PORT|auto")},
     ClipRecipe: _CLIP,

@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 import webbrowser
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -104,7 +104,7 @@ def view(
     if export is not None:
         report.line(f"Open in a browser: {export}")
     else:
-        serve(report, loaded, names, serving, None if times is None else partial(_changed, results, times))
+        serve(report, loaded, names, serving, None if times is None else _changed(results, times))
 
 
 def serve(
@@ -112,7 +112,7 @@ def serve(
     results: Sequence[Result],
     names: Sequence[str],
     serving: Serving = Serving(port=0),
-    changed: Callable[[], Iterator[Sequence[Result]]] | None = None,
+    changed: Iterator[Sequence[Result]] | None = None,
 ) -> None:
     """Serve the viewer, say where, open a browser, and wait for Ctrl-C; `changed` yields results that were replaced."""
     from vggtjax.results.viewer.server import PageServer
@@ -132,12 +132,13 @@ def serve(
         elif not serving.no_browser and not _open_browser(server.access.url):
             report.line("No browser could be opened here; open the address in one.")
 
-        def follow() -> None:
-            for new in changed() if changed is not None else ():
+        def follow(replaced: Iterator[Sequence[Result]]) -> None:
+            for new in replaced:
                 with suppress(VggtjaxError):
                     server.show(page_of(new))
 
-        threading.Thread(target=follow, daemon=True).start()
+        if changed is not None:
+            threading.Thread(target=follow, args=[changed], daemon=True).start()
         try:
             server.serve_forever()
         except KeyboardInterrupt:

@@ -1,9 +1,11 @@
 """A finished result and new frames of its place -> a result of both, in the frame and scale of the old one.
 
-features of patches -> anchors: frames of the result that show the place of the new ones, spread over its path
-windows of anchors and new frames, run by the method as it is
-each window is joined to the result, and to other windows, by the depth, confidence and cameras of its anchors
-all joins are solved together; the old frames stay as they are, bit by bit
+    features of patches -> anchors: frames of the result that show the place of the new ones, spread over its path
+    windows of anchors and new frames, run by the method as it is
+    each window is joined to the result, and to other windows, by the depth, confidence and cameras of its anchors
+    all joins are solved together
+
+The old frames stay as they are, bit by bit.
 """
 
 from __future__ import annotations
@@ -24,20 +26,19 @@ from vggtjax.clips.clip import Clip, read_clip
 from vggtjax.clips.media.sampling import Sampling
 from vggtjax.clips.preprocessing import Fitter
 from vggtjax.clips.sources import ClipSource, open_source
-from vggtjax.errors import InputError, one_line, whole_number
+from vggtjax.errors import InputError, one_line
 from vggtjax.method.fusion.family import FusionParams
 from vggtjax.method.fusion.file import fusion_digest
 from vggtjax.network.checkpoint import Model
 from vggtjax.options import METHODS, Options
 from vggtjax.pipeline.agreement import agree_with_pixels
 from vggtjax.pipeline.running import check_kinds
-from vggtjax.pipeline.windows.growth import Growth, PlaceError, bytes_of, grow
-from vggtjax.pipeline.windows.join import JoinRule
-from vggtjax.pipeline.windows.overlap import FEWEST_ANCHORS, LEAST_OVERLAP
+from vggtjax.pipeline.windows.growth import Growth, PlaceError, bytes_of
+from vggtjax.pipeline.windows.plan import Extending
 from vggtjax.pipeline.windows.run import Tools, tools_of
 from vggtjax.pipeline.windows.store import FOLDER, WindowStore
 from vggtjax.pipeline.windows.whole import window_name
-from vggtjax.progress import OnStage, Progress, StageSeconds, no_stage
+from vggtjax.progress import OnStage, Progress, StageSeconds, no_progress, no_stage
 from vggtjax.results.disk import announce, forecast_bytes
 from vggtjax.results.folder import check_folder
 from vggtjax.results.reconstruction import Reconstruction
@@ -46,35 +47,6 @@ from vggtjax.results.result import missing_fields, without_mask
 from vggtjax.results.saving import Saving
 from vggtjax.storage.interruption import kept
 from vggtjax.storage.writing import locked_folder, write_errors
-
-
-@dataclasses.dataclass(frozen=True)
-class Extending:
-    """How a result is extended. Raises InputError for an invalid value.
-
-    Attributes:
-        prefix: letters before the names of the new frames, such as day2_, where they have names of old ones
-        window: frames that are run together: anchors and new ones
-        anchors: how many of them are frames that are known already, at least 3
-        least_overlap: frames that overlap by less, from 0 to 1, show another place; measured with the demonstration
-            model alone
-    """
-
-    prefix: str = ""
-    window: int = 32
-    anchors: int = 8
-    least_overlap: float = LEAST_OVERLAP
-
-    def __post_init__(self) -> None:
-        whole_number("anchors", self.anchors, FEWEST_ANCHORS)
-        whole_number("window", self.window, self.anchors + 1)
-        if not 0 < self.least_overlap < 1:
-            raise InputError(f"least_overlap is {self.least_overlap}; expected a number between 0 and 1")
-
-    def parts(self, frames: int) -> list[range]:
-        """Return the new frames of each window."""
-        length = self.window - self.anchors
-        return [range(start, min(start + length, frames)) for start in range(0, frames, length)]
 
 
 def extend(
@@ -115,17 +87,14 @@ def extend(
         OutputError: `out` cannot be written, or another run is writing it.
         DeviceMemoryError: a window does not fit in the memory of the device.
     """
+    check_kinds(model=model)
     check_result(model, result)
-    options = (options or options_of(result)).changed(refine_cameras=False)
-    check_kinds(model=model, options=options)
+    options = options_of(result) if options is None else options
+    check_kinds(options=options)
+    options = options.changed(refine_cameras=False)
     _check_method(result, options, fusion)
     seconds = StageSeconds()
-
-    @contextmanager
-    def stage(name: str) -> Iterator[Progress | None]:
-        with seconds.stage(name), on_stage(name) as progress:
-            yield progress
-
+    stage = seconds.telling(on_stage)
     if out is not None:
         check_folder(Path(out), saving.names(tracks=result.track_frames is not None))
     if not isinstance(clip, Clip):
@@ -135,7 +104,7 @@ def extend(
     _check_clip(result, clip, names)
     tools = tools_of(model, options.changed(consistent_depth=False), clip.size, fusion=fusion, pad_frames=True)
     if out is None:
-        return without_mask(grown(result, clip, names, tools, extending, options, None, stage))
+        return without_mask(grow(result, clip, names, tools, extending, options, None, stage))
     sizes = np.concatenate([result.source_size, clip.source_size])
     announce(out, forecast_bytes((len(sizes), *clip.images.shape[1:3]), sizes, saving))
     settings = {
@@ -146,13 +115,13 @@ def extend(
         "versions": versions(),
     }
     with _kept_windows(Path(out), settings) as store:
-        both = without_mask(grown(result, clip, names, tools, extending, options, store, stage))
+        both = without_mask(grow(result, clip, names, tools, extending, options, store, stage))
         with stage("write") as progress:
             both.save(out, saving=saving, progress=progress, facts=RunFacts(seconds.seconds))
     return both
 
 
-def grown(
+def grow(
     result: Reconstruction,
     clip: Clip,
     names: list[str],
@@ -161,13 +130,12 @@ def grown(
     options: Options,
     store: WindowStore | None = None,
     on_stage: OnStage = no_stage,
-    rule: JoinRule = JoinRule(),
 ) -> Reconstruction:
-    """Compare the frames, run the windows that are not in the store, and return the joined result."""
+    """Run the windows that are not in the store, those first that overlap most, and return the joined result."""
     with on_stage("compare frames") as progress:
         known, columns = _patches(tools, result.images, progress)
         new, _ = _patches(tools, clip.images, progress)
-        growth = Growth(result, clip, names, known, new, columns, extending.least_overlap, rule)
+        growth = Growth(result, clip, names, known, new, columns, extending.least_overlap)
 
     def run(anchored: Clip, part: range) -> Reconstruction:
         name = window_name(part.start)
@@ -178,12 +146,21 @@ def grown(
                 store.save(name, window)
         return window
 
+    parts = extending.parts(len(clip))
+    total = len(parts)
     with on_stage("windows") as progress:
-        return grow(growth, extending.parts(len(clip)), extending.anchors, run, progress)
+        while parts:
+            part, anchors = growth.next_part(parts, extending.anchors)
+            growth.add(part, anchors, run(growth.anchored(part, anchors), part))
+            parts.remove(part)
+            (progress or no_progress)(total - len(parts), total)
+    return growth.result()
 
 
 def options_of(result: Reconstruction) -> Options:
     """Return the options that a result was made with, as far as its settings tell, without `refine_cameras`."""
+    if result.method not in METHODS:
+        raise InputError(f"the result is of {one_line(result.method, 40)}; expected one that vggtjax made")
     row = METHODS[result.method]
     defaults = {"threshold": row.threshold, "mask": row.mask}  # absent from settings where they are the method's own
     names = {field.name for field in dataclasses.fields(Options)} - {"method", "refine_cameras"}
@@ -198,8 +175,6 @@ def check_result(model: Model, result: Reconstruction) -> None:
     """Raise InputError where a result is not of this model, or lacks what anchors need."""
     if not isinstance(result, Reconstruction):
         raise InputError(f"the result is a {type(result).__name__}; expected what Reconstruction.load returns")
-    if result.method not in METHODS:
-        raise InputError(f"the result is of {one_line(result.method, 40)}; expected one that vggtjax made")
     if result.model_name != model.name:
         raise InputError(
             f"the result is of the model {one_line(result.model_name, 60)!r} and {model.name!r} is given; expected the "
@@ -295,6 +270,5 @@ def _patches(tools: Tools, images: np.ndarray, progress: Progress | None) -> tup
         pixels = image / np.float32(255) if image.dtype == np.uint8 else image
         patches, columns = tools.patches(pixels[None])
         found.append(patches[0])
-        if progress is not None:
-            progress(number, len(images))
+        (progress or no_progress)(number, len(images))
     return np.stack(found), columns

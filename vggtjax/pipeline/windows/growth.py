@@ -6,7 +6,6 @@ The old result is node 0, the windows are nodes 1, 2, ...; all joins are solved 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,9 +17,9 @@ from vggtjax.clips.clip import Clip
 from vggtjax.clips.fingerprint import source_setting
 from vggtjax.errors import InputError
 from vggtjax.pipeline.windows.graph import IDENTITY, edge_of, solve_graph
-from vggtjax.pipeline.windows.join import Join, JoinRule, join_windows, reach_of
-from vggtjax.pipeline.windows.overlap import FEWEST_ANCHORS, Places, choose_anchors, unconnected
-from vggtjax.progress import Progress
+from vggtjax.pipeline.windows.join import Join, join_windows, reach_of
+from vggtjax.pipeline.windows.overlap import Places, choose_anchors, unconnected
+from vggtjax.pipeline.windows.plan import FEWEST_ANCHORS
 from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.result import ARRAYS, TRACKS, show_points
 
@@ -60,7 +59,6 @@ class Growth:
         known, new: patches of the frames of both, as `thinned` returns them.
         columns: patches in a row.
         bound: the least overlap of frames that show one place.
-        rule: how anchors join.
     """
 
     def __init__(
@@ -72,17 +70,16 @@ class Growth:
         new: Float32[np.ndarray, "M N C"],
         columns: int,
         bound: float,
-        rule: JoinRule,
     ) -> None:
-        self.clip, self.names, self._rule, self._bound = clip, names, rule, bound
+        self.clip, self.names, self._bound = clip, names, bound
         self.nodes: list[Reconstruction] = [result]
         self._windows: list[_Window] = []
         self._frames = [(0, frame) for frame in range(len(result.depth))]  # known ones: node, and number in it
         self._usable = _shows_static(result)
         self._centres = camera_centres(result.camera_from_world).astype(np.float64)
         self._worlds = [IDENTITY]  # along the best joins, until all are solved together
-        self._new, self._places = new, Places.of(known, columns)
-        self._overlaps = self._places.overlaps(new)  # of the new frames with the known ones
+        places = Places.of(known, columns)
+        self._overlaps, self._among = places.overlaps(new), places.overlaps(new, new)  # with known ones; of the new
 
     def next_part(self, parts: list[range], count: int) -> tuple[range, list[int]]:
         """Return the part that overlaps most with what is known, and its anchors, by number among the known frames.
@@ -100,8 +97,7 @@ class Growth:
         inside = slice(part.start, part.stop)
         if best[inside].max() < self._bound:
             raise self._elsewhere([frame for each in parts for frame in each], usable < len(self._usable))
-        own = Places.overlaps(self._places, self._new[inside], self._new[inside])
-        if stray := unconnected(best[inside] >= self._bound, own >= self._bound):
+        if stray := unconnected(best[inside] >= self._bound, self._among[inside, inside] >= self._bound):
             raise self._elsewhere([part.start + number for number in stray])
         return part, choose_anchors(self._overlaps[inside], self._centres, self._usable, count, self._bound)
 
@@ -134,7 +130,7 @@ class Growth:
         joins = {}
         for node in sorted({node for node, _ in placed}):
             pairs = [(frame, position) for position, (of, frame) in enumerate(placed) if of == node]
-            joins[node] = join_windows(self.nodes[node], window, pairs, self._rule)
+            joins[node] = join_windows(self.nodes[node], window, pairs)
         fits = {node: join for node, join in joins.items() if join.pixels and join.residual <= _WORST}
         if not fits:
             raise self._apart(part, list(joins.values()))
@@ -148,8 +144,7 @@ class Growth:
         self._usable = np.concatenate([self._usable, _shows_static(window)[new]])
         centres = checked_centres(align(window.camera_from_world[new], self._worlds[-1]))
         self._centres = np.concatenate([self._centres, centres])
-        found = self._places.overlaps(self._new, self._new[part.start : part.stop])
-        self._overlaps = np.concatenate([self._overlaps, found], axis=1)
+        self._overlaps = np.concatenate([self._overlaps, self._among[:, part.start : part.stop]], axis=1)
 
     def result(self) -> Reconstruction:
         """Solve all joins together, and return the joined result."""
@@ -242,24 +237,6 @@ class Growth:
             residual = min(join.residual for join in joins if join.pixels)
             reason = f"depth and cameras of their anchors differ by {residual:.0%} of the depth, more than {_WORST:.0%}"
         return PlaceError(f"{_listed(names)} cannot be joined: {reason}", names)
-
-
-def grow(
-    growth: Growth,
-    parts: list[range],
-    count: int,
-    run: Callable[[Clip, range], Reconstruction],
-    progress: Progress | None = None,
-) -> Reconstruction:
-    """Run parts of the new frames with up to `count` anchors each, those first that overlap most; return all joined."""
-    total = len(parts)
-    while parts:
-        part, anchors = growth.next_part(parts, count)
-        growth.add(part, anchors, run(growth.anchored(part, anchors), part))
-        parts = [other for other in parts if other != part]
-        if progress is not None:
-            progress(total - len(parts), total)
-    return growth.result()
 
 
 def bytes_of(images: Float32[np.ndarray, "F H W 3"]) -> UInt8[np.ndarray, "F H W 3"]:

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64
 
-LEAST_OVERLAP = 0.4  # measured: 48 walks and 8 filmed clips reach .41, other rooms .32, another clip of DAVIS .48 once
-FEWEST_ANCHORS = 3
+from vggtjax.pipeline.windows.plan import FEWEST_ANCHORS, SAME_PLACE
+
 _MOST_PATCHES = 256  # of a frame, evenly spread
 _ELSEWHERE = 1 / 3  # of a picture's width: so far away is another place
 _SPREAD = 0.1  # what an anchor at the far end of the path counts for, compared with one that shows a new frame whole
@@ -57,7 +57,7 @@ def choose_anchors(
     centres: Float[np.ndarray, "F 3"],
     usable: Bool[np.ndarray, " F"],
     count: int,
-    bound: float = LEAST_OVERLAP,
+    bound: float = SAME_PLACE,
 ) -> list[int]:
     """Return up to `count` frames that show the place of new ones, spread over the path.
 

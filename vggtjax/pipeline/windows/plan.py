@@ -1,4 +1,4 @@
-"""Which frames each window of a long clip has. Does not import jax."""
+"""Which frames each window of a long clip has, or of frames that are added to a result. Does not import jax."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from vggtjax.errors import InputError, whole_number
 
 LEAST_OVERLAP = 2  # frames; one frame tells nothing of how cameras move
+FEWEST_ANCHORS = 3
+SAME_PLACE = 0.4  # overlap of frames that show one place, as `windows.overlap` measures it
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,35 @@ class Windows:
     def cuts(self, frames: int) -> bool:
         """Return whether a clip of so many frames is cut: it is longer than a window."""
         return bool(self.window) and frames > self.window
+
+
+@dataclass(frozen=True)
+class Extending:
+    """How frames are added to a result. Raises InputError for a bad value.
+
+    Attributes:
+        prefix: letters before the names of the new frames, such as day2_, where they have names of old ones
+        window: frames that are run together: anchors and new ones
+        anchors: how many of them are frames that are known already, at least 3
+        least_overlap: frames that overlap by less, from 0 to 1, show another place; measured with the demonstration
+            model alone
+    """
+
+    prefix: str = ""
+    window: int = 32
+    anchors: int = 8
+    least_overlap: float = SAME_PLACE
+
+    def __post_init__(self) -> None:
+        whole_number("anchors", self.anchors, FEWEST_ANCHORS)
+        whole_number("window", self.window, self.anchors + 1)
+        if not 0 < self.least_overlap < 1:
+            raise InputError(f"least_overlap is {self.least_overlap}; expected a number between 0 and 1")
+
+    def parts(self, frames: int) -> list[range]:
+        """Return the new frames of each window."""
+        length = self.window - self.anchors
+        return [range(start, min(start + length, frames)) for start in range(0, frames, length)]
 
 
 def plan_windows(frames: int, window: int, overlap: int) -> list[range]:

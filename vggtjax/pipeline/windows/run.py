@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -48,7 +47,7 @@ from vggtjax.pipeline.windows.plan import Windows, plan_windows
 from vggtjax.pipeline.windows.store import FOLDER, WindowStore, write_cut
 from vggtjax.pipeline.windows.tracks import Follow, Images, Tracked, TrackStart
 from vggtjax.pipeline.windows.whole import Whole, store_window
-from vggtjax.progress import OnStage, Progress, StageSeconds, no_progress, no_stage
+from vggtjax.progress import OnStage, StageSeconds, no_progress, no_stage
 from vggtjax.results.disk import announce, forecast_bytes
 from vggtjax.results.folder import check_folder
 from vggtjax.results.reconstruction import Reconstruction
@@ -219,6 +218,7 @@ def run_windows(
         consistent: make the depth of the joined clip consistent, by its pixels alone.
     """
     opened, seconds = open_source(source), StageSeconds()
+    stage = seconds.telling(plan.on_stage)
     check_folder(out, plan.saving.names(tracks=plan.tracks is not None))
     frames = count_frames(opened, plan.sampling) if plan.frames is None else plan.frames
     if not windows.cuts(frames):
@@ -259,7 +259,7 @@ def run_windows(
         def stopped() -> str:
             return f"{store.count()} of {len(cut)} windows are kept; the same command goes on from there"
 
-        with kept(stopped), seconds.stage("windows"), plan.on_stage("windows") as progress:
+        with kept(stopped), stage("windows") as progress:
             for number, clip in enumerate(chain([first], clips)):
                 seen.add(clip, cut[number])
                 store_window(number, clip, cut[number], store, tools.run, tools.describe)
@@ -268,18 +268,13 @@ def run_windows(
         if plan.tracks is not None:
             assert tools.follow is not None
             queries = parse_queries(plan.tracks, seen.clip()) if isinstance(plan.tracks, str) else plan.tracks
-            with seconds.stage("follow points"), plan.on_stage("follow points") as progress:
+            with stage("follow points") as progress:
                 tracks = whole.tracks(queries, tools.follow, progress)
         with kept(stopped), seconds.stage("join and blend"):
             result = whole.result(clip, loops=not windows.no_loops, tracks=tracks)
 
         def pictures() -> Iterator[UInt8[np.ndarray, "h w 3"]]:
             return (np.asarray(frame.image) for frame in opened.frames(plan.sampling))
-
-        @contextmanager
-        def stage(name: str) -> Iterator[Progress | None]:
-            with seconds.stage(name), plan.on_stage(name) as progress:
-                yield progress
 
         result = agree_with_pixels(result, pictures, Options(consistent_depth=consistent), on_stage=stage)
         result = without_mask(result)
