@@ -16,7 +16,7 @@ from typing import Any
 
 from benchmarks.worker import PeakMemory
 from vggtjax.errors import InputError
-from vggtjax.storage.host import process_bytes
+from vggtjax.storage.memory import process_bytes
 
 
 def run_command(words: list[str], cache: Path, devices: int = 1) -> dict[str, Any]:

@@ -24,7 +24,8 @@ import numpy as np
 from tests.shared.seeded import seeded_images
 from vggtjax.config import DA3, vggt_1b
 from vggtjax.research.parity.public_code import add_checkout, build, give_weights, read_weights
-from vggtjax.storage.host import core_count, process_bytes
+from vggtjax.storage.memory import process_bytes
+from vggtjax.storage.process import core_count
 
 IMAGE_MEAN, IMAGE_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # as the network's, without its imports
 _REFERENCE = {"float32": "chosen", "bfloat16": "first"}  # three digits can choose another frame
@@ -35,7 +36,7 @@ Run = Callable[[str, np.ndarray, np.ndarray | None], Outputs]  # work, images [S
 
 def ours(weights: Path, dtype: str) -> Run:
     """Return this library's passes: a plain one, or a whole method."""
-    from vggtjax.storage.host import keep_freed_memory
+    from vggtjax.storage.process import keep_freed_memory
 
     keep_freed_memory()
     import jax

@@ -13,7 +13,7 @@ from benchmarks.suite.measure import compiling_anew, without_memory
 from benchmarks.suite.report import Row
 from benchmarks.suite.workloads import WORKLOADS, Workload
 from vggtjax.errors import InputError
-from vggtjax.storage.host import keep_freed_memory
+from vggtjax.storage.process import keep_freed_memory
 
 
 def suite(

@@ -17,7 +17,7 @@ import numpy as np
 
 from tests.shared.high_water import reset_high_water
 from vggtjax.network.precision import full_precision
-from vggtjax.storage.host import process_bytes
+from vggtjax.storage.memory import process_bytes
 
 _SUSTAINED = 0.05  # seconds
 

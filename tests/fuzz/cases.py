@@ -18,7 +18,7 @@ from tests.fuzz.changes.text import NAMES
 from tests.fuzz.mutations import mutated
 from tests.shared.high_water import reset_high_water
 from vggtjax.errors import VggtjaxError
-from vggtjax.storage.host import process_bytes
+from vggtjax.storage.memory import process_bytes
 
 MOST_SECONDS = 10.0
 MOST_LETTERS = 500  # of a message

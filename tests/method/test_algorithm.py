@@ -165,7 +165,8 @@ def test_soft_masks_of_any_caller_are_those_of_the_soft_method(model):
     soft = jax.jit(reconstruct_soft, static_argnames="config")(model.params, images, model.config, masking)
     made, passes = infer(model.params, images, model.config, masks=masking)
     # Two programs round differently, which grows in the product of the five maps, most where a map hardly varies.
-    assert np.allclose(passes.first.depth, soft.passes.first.depth, rtol=1e-5)
+    depths: Any = passes.first.depth, soft.passes.first.depth
+    assert np.allclose(*depths, rtol=1e-5)
     assert np.abs(passes.saliency - soft.passes.saliency).mean() < 5e-3
     for found in (passes, soft.passes):
         shares = soft_pixels(found.saliency, masking, size=(SIDE, SIDE), threshold="otsu")

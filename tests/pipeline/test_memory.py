@@ -14,7 +14,7 @@ from vggtjax.network.kernels.cpu_attention import _chunks
 from vggtjax.pipeline import memory
 from vggtjax.pipeline.pretrained.embedded import demo_model
 from vggtjax.pipeline.windows.choice import Planned
-from vggtjax.storage.host import host_room, own_limits
+from vggtjax.storage.memory import host_room, own_limits
 
 _ROOT = Path(__file__).parents[2]
 _FULL = Planned(vggt_1b(), 5_026_145_968)  # of float32

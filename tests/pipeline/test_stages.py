@@ -15,8 +15,8 @@ from vggtjax.method.passes import first_pass, second_pass
 from vggtjax.network.backbone import ClipBatch
 from vggtjax.network.checkpoint import Model
 from vggtjax.network.model import init_params, parameter_shapes
-from vggtjax.pipeline.devices import padded_frames
 from vggtjax.pipeline.fields import assembled_fields
+from vggtjax.pipeline.lengths import padded_frames
 from vggtjax.pipeline.run import compile_ahead
 from vggtjax.pipeline.steps import Compile, Execute
 from vggtjax.results.not_finite import NotFiniteWarning, warn_of_not_finite

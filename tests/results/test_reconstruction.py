@@ -224,7 +224,7 @@ def test_two_thousand_frames_open_below_200_megabytes(tmp_path):
     assert path.stat().st_size > 0.5e9
     code = (
         "import sys\n"
-        "from vggtjax.storage.host import process_bytes\n"
+        "from vggtjax.storage.memory import process_bytes\n"
         "from vggtjax.results.reconstruction import Reconstruction\n"
         "result = Reconstruction.load(sys.argv[1])\n"
         "assert result.depth.shape == (2000, *map(int, sys.argv[2:]))\n"

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from vggtjax.storage.host import process_bytes
+from vggtjax.storage.memory import process_bytes
 
 _RESET = "5"  # of clear_refs
 

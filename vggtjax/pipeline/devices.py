@@ -1,4 +1,4 @@
-"""The frames of one clip on several devices: the mesh, where parameters and frames are on it, and padded lengths."""
+"""The frames of one clip on several devices: the mesh, and where parameters and frames are on it."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ from jaxtyping import Array
 from vggtjax.errors import InputError, whole_number
 from vggtjax.network.kernels.frames import AXIS, BY_FRAME, REPLICATED, Frames
 from vggtjax.storage.backend import backend
-
-_DIGITS = 4  # significant binary digits of padded lengths: no clip gets longer by more than an eighth
 
 
 def frames_mesh(devices: int) -> Mesh | None:
@@ -60,18 +58,6 @@ def on_host(x: Array | np.ndarray) -> np.ndarray:
 
         return np.asarray(multihost_utils.process_allgather(x, tiled=True))
     return np.asarray(x)
-
-
-def padded_frames(frames: int, offsets: tuple[int, ...]) -> int:
-    """Return the length rounded up to four significant binary digits: 1 to 16, 18, 20, ... 32, 36, ...
-
-    Clips of similar length then share compiled programs. A clip is not padded if one of its frames has no other frame
-    at any of the `offsets` of the motion cues: padding would give that frame another one to be compared with.
-    """
-    if not all(any(0 <= frame + offset < frames for offset in offsets) for frame in range(frames)):
-        return frames
-    step = 1 << max(frames.bit_length() - _DIGITS, 0)
-    return -(-frames // step) * step
 
 
 def shared_length(frames: int, mesh: Mesh | None) -> int:

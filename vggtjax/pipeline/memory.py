@@ -21,7 +21,7 @@ from vggtjax.network.heads.dpt_head import HIDDEN, PIXELS_AT_ONCE
 from vggtjax.network.kernels.cpu_attention import LOGITS_OF_ALL_HEADS, chunk_count
 from vggtjax.network.kernels.gathered_attention import GATHERED_AT_ONCE
 from vggtjax.options import find_method
-from vggtjax.storage.host import Room, host_room
+from vggtjax.storage.memory import Room, host_room
 
 ERROR = 0.15  # of a measured peak: predictions are as near
 _FLOAT = 4  # bytes

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 
 from vggtjax.errors import VggtjaxError, one_line
 from vggtjax.storage.cache import TRIALS, cache_folder
-from vggtjax.storage.host import core_count
+from vggtjax.storage.process import core_count
 from vggtjax.storage.writing import writing
 
 _UNITS = {"amx_bf16", "avx512_bf16", "bf16"}  # as Linux names them: Intel's AMX; Intel and AMD; ARM

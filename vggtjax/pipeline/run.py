@@ -28,7 +28,7 @@ from vggtjax.network.kernels.frames import BY_FRAME, REPLICATED, Frames
 from vggtjax.network.surroundings import own_settings
 from vggtjax.options import Options
 from vggtjax.pipeline.agreement import agree_with_pixels, agrees_with_pixels
-from vggtjax.pipeline.devices import frames_mesh, on_host, padded_frames, replicate, shard_frames, shared_length
+from vggtjax.pipeline.devices import frames_mesh, on_host, replicate, shard_frames, shared_length
 from vggtjax.pipeline.fields import (
     assembled_fields,
     clip_fields,
@@ -41,6 +41,7 @@ from vggtjax.pipeline.fields import (
 from vggtjax.pipeline.inputs import GivenMasks, Inputs, read_inputs
 from vggtjax.pipeline.known.apply import apply_known, scaled
 from vggtjax.pipeline.known.options import KnownGeometry
+from vggtjax.pipeline.lengths import padded_frames
 from vggtjax.pipeline.refinement.refine import check_refinement
 from vggtjax.pipeline.running import Running, changed, check_kinds
 from vggtjax.pipeline.steps import Compile, Execute, StageMemory

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, ParamSpec, TypeVar
 import jax
 
 from vggtjax.progress import OnStage, Progress, no_progress, no_stage
-from vggtjax.storage.host import core_count, return_freed_memory
+from vggtjax.storage.process import core_count, return_freed_memory
 
 _Parameters = ParamSpec("_Parameters")
 _Result = TypeVar("_Result")

@@ -22,7 +22,7 @@ from typing import IO, NamedTuple
 import numpy as np
 
 from vggtjax.errors import ResultError, check_regular, one_line
-from vggtjax.storage.host import free_bytes
+from vggtjax.storage.memory import free_bytes
 
 _DEFLATE_LEVEL = 1  # higher levels take several times as long and save a few percent
 SIZE_LIMIT = 64 * 2**30  # bytes of all arrays of one file

@@ -39,7 +39,7 @@ def source_digest() -> str:
     """Return versions, platform, cores, and a digest of all sources: what results depend on besides arguments."""
     import jax
 
-    from vggtjax.storage.host import core_count
+    from vggtjax.storage.process import core_count
 
     versions = [version(name) for name in ("jax", "jaxlib", "flax")]
     return f"{' '.join(versions)} {jax.default_backend()} {core_count()} {_package_digest()}"

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from vggtjax.storage.host import give_devices_threads
+from vggtjax.storage.process import give_devices_threads
 
 _WORK = """
 import hashlib, signal, sys, time

@@ -21,7 +21,7 @@ from vggtjax.pipeline.steps import Compile
 from vggtjax.pipeline.windows.plan import Windows
 from vggtjax.pipeline.windows.store import FOLDER, write_cut
 from vggtjax.results.saving import Saving
-from vggtjax.storage.host import Room, in_gigabytes
+from vggtjax.storage.memory import Room, in_gigabytes
 
 SIDE = 96  # of the model's frames
 

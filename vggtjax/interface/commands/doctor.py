@@ -18,7 +18,7 @@ from vggtjax.errors import VggtjaxError, one_line
 from vggtjax.interface.commands.flags import InWords
 from vggtjax.interface.commands.report import Report
 from vggtjax.storage.cache import CONVERTED, cache_folder, cache_parts, clear_cache, size_of
-from vggtjax.storage.host import in_gigabytes
+from vggtjax.storage.memory import in_gigabytes
 from vggtjax.storage.versions import installed_version
 
 PACKAGES = ("jax", "jaxlib", "flax", "numpy", "scipy", "pillow", "av", "safetensors", "tyro")
@@ -77,7 +77,7 @@ def facts(gpu: str | None = None) -> dict[str, Any]:
     import jax
 
     from vggtjax.storage.backend import backend
-    from vggtjax.storage.host import own_limits, rooms, total_bytes
+    from vggtjax.storage.memory import own_limits, rooms, total_bytes
 
     backend()
     devices = []

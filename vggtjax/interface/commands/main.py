@@ -40,8 +40,8 @@ from vggtjax.interface.commands.scenes import scenes
 from vggtjax.interface.commands.train import train
 from vggtjax.interface.commands.view import view
 from vggtjax.storage.cache import enable_compilation_cache
-from vggtjax.storage.host import check_limits, give_devices_threads, keep_freed_memory
 from vggtjax.storage.interruption import message as message_of_interruption
+from vggtjax.storage.process import check_limits, give_devices_threads, keep_freed_memory
 
 
 class Command(NamedTuple):

@@ -14,8 +14,8 @@ from vggtjax.interface.commands.flags import InWords
 from vggtjax.interface.commands.report import Report
 from vggtjax.options import METHODS, Options, has_accelerator
 from vggtjax.storage.cache import enable_compilation_cache
-from vggtjax.storage.host import keep_freed_memory
 from vggtjax.storage.json_values import read_json
+from vggtjax.storage.process import keep_freed_memory
 
 if TYPE_CHECKING:
     from vggtjax.method.fusion.family import FusionParams

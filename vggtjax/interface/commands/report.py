@@ -17,7 +17,7 @@ from rich.text import Text
 
 from vggtjax.errors import one_line, printable
 from vggtjax.progress import Progress
-from vggtjax.storage.host import peak_bytes
+from vggtjax.storage.memory import peak_bytes
 
 if TYPE_CHECKING:
     from vggtjax.network.checkpoint import Model

@@ -12,7 +12,7 @@ import tyro
 from vggtjax.errors import InputError, check_extra
 from vggtjax.interface.commands.flags import InWords
 from vggtjax.interface.commands.report import Report
-from vggtjax.storage.host import run_in_calling_thread
+from vggtjax.storage.process import run_in_calling_thread
 from vggtjax.storage.writing import check_file, check_free
 from vggtjax.training.options import RunOptions
 

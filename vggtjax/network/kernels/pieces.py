@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from vggtjax.storage.host import core_count
+from vggtjax.storage.process import core_count
 
 NUMBERS_ON_CPU = 1600 * 1024  # of a piece on two cores: an MLP's hidden rows (26 MB) stay in the cache
 ROWS_ELSEWHERE = 2**18  # an MLP's hidden rows take 2 GB in bfloat16; smaller pieces cost kernels and copies

@@ -15,7 +15,7 @@ from vggtjax.network.checkpoint import Model
 from vggtjax.pipeline import memory
 from vggtjax.pipeline.windows.frames import count_frames
 from vggtjax.pipeline.windows.plan import Windows
-from vggtjax.storage.host import in_gigabytes
+from vggtjax.storage.memory import in_gigabytes
 
 _LENGTHS = (64, 48, 32, 24, 16, 12, 8)  # frames of a window, the longest that fits
 

@@ -15,7 +15,7 @@ from vggtjax.network.checkpoint import Model
 from vggtjax.research.parity.outputs import Parity
 from vggtjax.research.parity.own_run import Check, Frames
 from vggtjax.research.parity.public_run import Facts
-from vggtjax.storage.host import peak_bytes
+from vggtjax.storage.memory import peak_bytes
 
 _YES = {True: "yes", False: "**no**"}
 

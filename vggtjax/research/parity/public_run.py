@@ -21,7 +21,7 @@ import numpy as np
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError, VggtjaxError, one_line
 from vggtjax.research.parity.outputs import CAMERAS, MASKED, OUTPUTS, Arrays
-from vggtjax.storage.host import peak_bytes
+from vggtjax.storage.memory import peak_bytes
 
 
 @dataclass(frozen=True)
