@@ -32,7 +32,7 @@ def init_probes(seed: int, config: VGGTConfig):
     return {"mean": {"kernel": jnp.full((3, 3), 0.1 * (1 + seed)), "bias": jnp.zeros(3)}}
 
 
-def make_batch(key, textures, phase: Phase, frames: int):
+def make_batch(key, textures, phase: Phase, frames: int, patch_size: int):
     """Return noise images."""
     return textures * jax.random.uniform(key, (phase.batch, frames, phase.height, phase.width, 3))
 

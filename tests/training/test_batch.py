@@ -26,11 +26,11 @@ from vggtjax.training.truth import targets
 PHASE = Phase(1, 4, (2,), 28, 28, motion=(0.5, 1.0))
 WEIGHTS = LossWeights(depth=0, points=0, match=1, match_layers=(1,), probe=1, moments=1)
 
-render = jax.jit(make_batch, static_argnums=(2, 3), compiler_options=QUICK)
+render = jax.jit(make_batch, static_argnums=(2, 3, 4), compiler_options=QUICK)
 
 
 def drawn(phase, key=0):
-    return render(jax.random.key(key), textures(), phase, 2)
+    return render(jax.random.key(key), textures(), phase, 2, CONFIG.patch_size)
 
 
 @pytest.fixture(scope="module")

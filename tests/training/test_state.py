@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from tests.shared.tiny import tiny_model
-from tests.shared.training_runs import RECIPE, SHORT, TASK, init_probes, make_batch, objective, same, train_step
+from tests.shared.training_runs import CONFIG, RECIPE, SHORT, TASK, init_probes, make_batch, objective, same, train_step
 from vggtjax.config import MotionConfig
 from vggtjax.errors import CheckpointError, InputError
 from vggtjax.network.backbone import encode
@@ -40,7 +40,7 @@ def start():
 
 @pytest.fixture(scope="module")
 def batch():
-    return make_batch(jax.random.key(0), TASK.textures, SHORT.stages[0], 2)
+    return make_batch(jax.random.key(0), TASK.textures, SHORT.stages[0], 2, CONFIG.patch_size)
 
 
 def test_a_step_moves_heads_and_probes_alone(start, batch):

@@ -1,5 +1,7 @@
 """What the network should say, and where patches are seen again: by hand and against slow loops in float64."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,13 +11,20 @@ from tests.shared.generated import DYNAMIC, QUICK, clips
 from vggtjax.network.heads.pose import decode_pose
 from vggtjax.training.matching import MatchLoss, match_loss
 from vggtjax.training.scenes import SyntheticClip
-from vggtjax.training.truth import OCCLUDED, Matches, match_counts, matches, targets
+from vggtjax.training.truth import OCCLUDED, Matches, clips_of, match_counts, matches, targets
 
 PATCH = 4
 CENTRE = slice(PATCH // 2, None, PATCH)
 
-quick_targets = jax.jit(targets, compiler_options=QUICK)
-quick_matches = jax.jit(matches, static_argnums=1, compiler_options=QUICK)
+
+@partial(jax.jit, compiler_options=QUICK)
+def quick_targets(scenes):
+    return targets(clips_of(scenes, PATCH))
+
+
+@partial(jax.jit, compiler_options=QUICK)
+def quick_matches(scenes):
+    return matches(clips_of(scenes, PATCH), PATCH)
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +34,7 @@ def clip():
 
 @pytest.fixture(scope="module")
 def found(clip):
-    return jax.device_get(quick_matches(jax.tree.map(jnp.asarray, clip), PATCH))
+    return jax.device_get(quick_matches(jax.tree.map(jnp.asarray, clip)))
 
 
 def doubled(clip):
@@ -101,7 +110,7 @@ def passage():
 
 
 def test_matches_by_hand():
-    found = jax.device_get(quick_matches(passage(), PATCH))
+    found = jax.device_get(quick_matches(passage()))
     assert found.position.shape == (1, 3, 3, 16, 2)
     for r, s, patch in np.ndindex(3, 3, 16):
         row, column = divmod(patch, 4)

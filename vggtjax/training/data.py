@@ -11,6 +11,8 @@ from vggtjax.training.objective import Batch
 from vggtjax.training.recipe import Phase
 from vggtjax.training.scenes.render import SyntheticClip, generate
 from vggtjax.training.scenes.textures import Textures
+from vggtjax.training.truth import Clips, clips_of
+from vggtjax.training.world.pool import PoolClip
 
 GREY = 0.1  # share of clips without colour
 IN_ORDER = 0.5  # share of clips with frames in order of time
@@ -21,13 +23,14 @@ _POWERS = (1.5, 6.0)  # range of the exponent: from almost a diamond to almost a
 _TRAVEL = 0.5  # largest travel from the first frame to the last, in shares of the frame
 
 
-def make_batch(key: Array, textures: Textures, phase: Phase, frames: int) -> Batch:
+def make_batch(key: Array, textures: Textures, phase: Phase, frames: int, patch_size: int) -> Batch:
     """Return the batch of a JAX random key: `phase.batch` clips of `frames` frames, in random order and colours.
 
     The clips have the phase's height and width; its further `sizes` are not read. In a share `phase.suppressed` of the
-    clips, random regions are suppressed, in the same pairs of blocks. Pure; `phase` and `frames` are static.
+    clips, random regions are suppressed, in the same pairs of blocks. Pure; all but `key` and `textures` is static.
     """
     config = phase.scenes(frames)
+    drawn = phase.suppressed or phase.worlds  # steps of scenes and of worlds then are one program
 
     def one(key: Array) -> tuple[SyntheticClip, Array | None]:
         scene_key, order_key, colour_key = jax.random.split(key, 3)
@@ -37,15 +40,42 @@ def make_batch(key: Array, textures: Textures, phase: Phase, frames: int) -> Bat
         order = jnp.where(jax.random.uniform(coin_key) < IN_ORDER, jnp.arange(frames), order)
         clip = jax.tree.map(lambda leaf: leaf[order], clip)
         clip = clip._replace(images=_recolour(colour_key, clip.images, phase.gamma))
-        if not phase.suppressed:
-            return clip, None
-        region_key, coin_key = jax.random.split(jax.random.fold_in(key, _SUPPRESSION))
-        regions = random_regions(region_key, frames, phase.height, phase.width)[order]
-        return clip, regions & (jax.random.uniform(coin_key) < phase.suppressed)
+        return clip, _regions(key, phase, frames)[order] if drawn else None
 
-    clips, regions = jax.vmap(one)(jax.random.split(key, phase.batch))
-    if regions is None:
-        return Batch(clips)
+    scenes, regions = jax.vmap(one)(jax.random.split(key, phase.batch))
+    clips = clips_of(scenes, patch_size)
+    return Batch(clips) if regions is None else _suppressing(key, phase, clips, regions)
+
+
+def make_world_batch(key: Array, clips: PoolClip, phase: Phase, frames: int, patch_size: int) -> Batch:
+    """Return the batch of clips of worlds, [phase.batch, frames, ...], in random colours.
+
+    In a share `phase.masked_movers` of the clips in which something moves, its keys are suppressed. In clips at rest
+    those of random regions are, as in scenes. Pure; `phase`, `frames` and `patch_size` are static.
+    """
+    del patch_size
+    moves = clips.moving.any(axis=(1, 2, 3))
+
+    def one(key: Array, images: Array, moving: Array, moves: Array) -> tuple[Array, Array]:
+        _, order_key, colour_key = jax.random.split(key, 3)
+        masked = moves & (jax.random.uniform(order_key) < phase.masked_movers)
+        images = _recolour(colour_key, images.astype(jnp.float32) / 255, phase.gamma)
+        return images, jnp.where(masked, moving, _regions(key, phase, frames) & ~moves)
+
+    images, regions = jax.vmap(one)(jax.random.split(key, phase.batch), clips.images, clips.moving, moves)
+    depth = clips.depth.astype(jnp.float32)
+    seen = Clips(images, depth, clips.camera_from_world, clips.intrinsics, clips.tracks)
+    return _suppressing(key, phase, seen, regions)
+
+
+def _regions(key: Array, phase: Phase, frames: int) -> Bool[Array, "S H W"]:
+    """Return random regions in a share `phase.suppressed` of clips, none in the others."""
+    region_key, coin_key = jax.random.split(jax.random.fold_in(key, _SUPPRESSION))
+    regions = random_regions(region_key, frames, phase.height, phase.width)
+    return regions & (jax.random.uniform(coin_key) < phase.suppressed)
+
+
+def _suppressing(key: Array, phase: Phase, clips: Clips, regions: Bool[Array, "B S H W"]) -> Batch:
     low, high = phase.suppressed_pairs
     pairs = high - (high - low) * jax.random.uniform(jax.random.fold_in(key, _SUPPRESSION))
     return Batch(clips, regions, jnp.broadcast_to(pairs, (phase.batch,)), phase.suppress)

@@ -15,12 +15,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import numpy as np
 
 from vggtjax.network.checkpoint import Model
 from vggtjax.network.layers import Params
 from vggtjax.storage.writing import locked_folder
 from vggtjax.training.data import make_batch as make_scene_batch
+from vggtjax.training.data import make_world_batch
 from vggtjax.training.metrics import Row
 from vggtjax.training.objective import init_probes as init_scene_probes
 from vggtjax.training.objective import objective as scene_objective
@@ -30,6 +30,7 @@ from vggtjax.training.run import Run, labels_of, placement
 from vggtjax.training.scenes.textures import load_textures
 from vggtjax.training.start import adapted
 from vggtjax.training.state import Metrics, Objective, TrainingState, apply_gradient, loss_and_gradient
+from vggtjax.training.worlds import Worlds, draw_shape, opened_worlds
 
 GENERATED_NOTE = "model trained on generated scenes alone"
 _AHEAD = 2  # steps that the host may prepare while the device computes
@@ -67,15 +68,17 @@ class Task:
 
     Attributes:
         textures: second argument of `make_batch`; None for the textures of the training split.
-        make_batch: (key, textures, phase, frames) -> batch, with the last two static.
+        make_batch: (key, textures, phase, frames, patch size) -> batch, with the last three static.
         init_probes: (seed, config) -> parameters of the objective alone.
         objective: (trained, batch, config, weights, *, compute_dtype, remat) -> loss, metrics.
+        make_world_batch: (key, clips of a pool, phase, frames, patch size) -> batch, for steps with worlds.
     """
 
     textures: Any = None
     make_batch: Callable[..., Any] = make_scene_batch
     init_probes: Callable[..., Params] = init_scene_probes
     objective: Objective = scene_objective
+    make_world_batch: Callable[..., Any] = make_world_batch
 
 
 def train(
@@ -117,8 +120,8 @@ def train(
         run = Run(recipe, Path(out), task.init_probes(recipe.seed, recipe.model), params, labels, options)
         pace = _Pace(run, progress)
         pace.report()
-        with _signals() as received:
-            trainer = _Trainer(run, task)
+        with _signals() as received, opened_worlds(recipe, options.clips or Path(out) / "clips") as worlds:
+            trainer = _Trainer(run, task, worlds)
             while run.step < recipe.total_steps:
                 trainer.step()
                 if run.step % options.log_every == 0 or run.step == recipe.total_steps:
@@ -140,26 +143,19 @@ def train(
     return RunOutcome(run.state, finished, run.model_path)
 
 
-def draw_shape(recipe: Recipe, step: int) -> tuple[int, Phase, int]:
-    """Return the index of a step's phase, the phase with one of its sizes, and one of its numbers of frames.
-
-    The draw depends on the data seed and the step alone.
-    """
-    index, phase = recipe.phase_at(step)
-    generator = np.random.default_rng((recipe.data_seed, step))
-    frames = int(generator.choice(phase.frames))
-    return index, phase.of_size(int(generator.integers(len(phase.all_sizes)))), frames
-
-
 class _Trainer:
     """The compiled parts of a step; in the first steps of each interval, rendering is timed."""
 
-    def __init__(self, run: Run, task: Task) -> None:
+    def __init__(self, run: Run, task: Task, worlds: Worlds | None) -> None:
         where = placement(run.recipe)
         textures = load_textures("training") if task.textures is None else task.textures
         self._run, self._objective = run, task.objective
         self._textures = jax.device_put(textures, where.whole)
-        self._make_batch = jax.jit(task.make_batch, static_argnums=(2, 3), out_shardings=where.by_clip)
+        self._make_batch, self._make_world_batch = (
+            jax.jit(make, static_argnums=(2, 3, 4), out_shardings=where.by_clip)
+            for make in (task.make_batch, task.make_world_batch)
+        )
+        self._worlds = worlds
         self._key = jax.random.key(run.recipe.data_seed)
         self._compiled: set[tuple[Phase, int]] = set()
         self._ahead: deque[Metrics] = deque()
@@ -173,7 +169,10 @@ class _Trainer:
         wait = jax.block_until_ready if is_timed else lambda tree: tree
         wait(run.state)
         began = time.perf_counter()
-        batch = wait(self._make_batch(jax.random.fold_in(self._key, run.step), self._textures, phase, frames))
+        key = jax.random.fold_in(self._key, run.step)
+        clips = self._worlds.clips(run.step) if self._worlds else None
+        make, data = (self._make_batch, self._textures) if clips is None else (self._make_world_batch, clips)
+        batch = wait(make(key, data, phase, frames, recipe.model.patch_size))
         rendered = time.perf_counter()
         metrics, gradient = _loss_and_gradient(run.state.trained, batch, recipe, self._objective)
         run.state, metrics = wait(_apply_gradient(run.state, gradient, metrics, recipe))

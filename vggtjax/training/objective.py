@@ -21,14 +21,14 @@ from vggtjax.network.layers import LayerNorm, Params
 from vggtjax.network.model import HEADS, tap_patches
 from vggtjax.network.precision import Compute, full_precision
 from vggtjax.network.suppression import Suppression
-from vggtjax.storage.json_values import Natural, NotNegative, check_fields
+from vggtjax.storage.json_values import Natural, NotNegative, Share, check_fields
 from vggtjax.training.matching import MatchLoss
-from vggtjax.training.scenes.render import SyntheticClip
-from vggtjax.training.truth import MatchCounts, Matches, Targets, match_counts, matches, targets
+from vggtjax.training.truth import Clips, MatchCounts, Matches, Targets, match_counts, matches, targets
 
 PATCH_PROBE = 6  # position in the first frame (2), logarithm of depth (1), point in the first camera's frame (3)
 CAMERA_PROBE = 7 + 10  # translation (3), quaternion (4), moments of the flow from the first frame
 CONFIDENCE = 0.2  # weight of the logarithm of confidence, as in VGGT
+_NEAR = 0.1  # in mean distances: nearer points count as ones so near where errors are relative
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=("clips", "regions", "pairs"), meta_fields=("suppress",))
@@ -37,13 +37,13 @@ class Batch:
     """The clips of a step, and the random regions in which their keys are suppressed: a pytree.
 
     Attributes:
-        clips: the clips and their truth.
+        clips: the clips and what is read of their truth.
         regions: pixels of suppressed patches; None for no suppression in any clip.
         pairs: share of the pairs of blocks, from the first, that suppress keys, in (0, 1]; the same for all clips.
         suppress: how keys are suppressed; static under jit.
     """
 
-    clips: SyntheticClip
+    clips: Clips
     regions: Bool[Array, "B S H W"] | None = None
     pairs: Float[Array, " B"] | None = None
     suppress: Suppress = "zero"
@@ -65,6 +65,7 @@ class LossWeights:
         translation, rotation, field_of_view: L1 or Huber distance of the pose encoding's parts.
         huber: half width of the quadratic zone of the camera loss; 0 for L1.
         depth, points: confidence-weighted L1 of the dense heads; `gradient` is the share of the gradient term.
+        relative: power of the inverse depth by which dense errors are weighted: 0 for VGGT's loss, 1 for relative ones.
         match: cross-entropy of attention in `match_layers` against true matches.
         probe: linear read-outs of the tapped tokens (positions, depths, points, poses), used in training only.
         moments: linear read-outs of the camera tokens: means of the flow that determine the camera's motion.
@@ -77,6 +78,7 @@ class LossWeights:
     depth: NotNegative = 1.0
     points: NotNegative = 1.0
     gradient: NotNegative = 1.0
+    relative: Share = 0.0
     match: NotNegative = 0.0
     match_layers: tuple[Natural, ...] = (1, 2, 3)
     probe: NotNegative = 0.0
@@ -154,9 +156,11 @@ def objective(
     for name in weights.dense:
         predict = jax.checkpoint(predict_dense, static_argnums=(2, 3, 4)) if remat else predict_dense
         values, confidence = predict(model[HEADS[name]], [tap[name] for tap in taps], config, grid, name)
-        terms[name] = getattr(weights, name) * dense_loss(values, confidence, goals[name], weights.gradient)
+        weight = truth.known / jnp.maximum(truth.depth, _NEAR) ** weights.relative
+        loss = dense_loss(values, confidence, goals[name], weights.gradient, weight)
+        terms[name] = getattr(weights, name) * loss
         if name == "depth":
-            metrics["depth_error"] = _depth_error(values[..., 0], truth.depth)
+            metrics["depth_error"] = _depth_error(values[..., 0], truth)
             metrics["confidence"] = confidence.mean()
     if weights.match:
         terms["match"] = weights.match * sums.loss
@@ -178,14 +182,20 @@ def dense_loss(
     confidence: Float[Array, "B S H W"],
     truth: Float[Array, "B S H W V"],
     gradient: float,
+    weight: Float[Array, "B S H W"],
 ) -> Float[Array, ""]:
-    """Return VGGT's dense loss: the error weighted by confidence, minus its logarithm, and that of image gradients."""
+    """Return VGGT's dense loss: the error weighted by confidence, minus its logarithm, and that of image gradients.
+
+    Errors are multiplied by `weight`; pixels with a weight of 0 have no part in the loss.
+    """
+    known = weight > 0
     error = jnp.linalg.norm(values - truth, axis=-1) if values.shape[-1] > 1 else jnp.abs(values - truth)[..., 0]
-    loss = (confidence * error - CONFIDENCE * jnp.log(confidence)).mean()
+    loss = (confidence * weight * error - CONFIDENCE * jnp.log(confidence)).mean(where=known)
     for axis in (2, 3) if gradient else ():
         step = jnp.diff(values, axis=axis) - jnp.diff(truth, axis=axis)
-        weight = jax.lax.slice_in_dim(confidence, 1, None, axis=axis)
-        loss = loss + gradient * (weight * jnp.abs(step).mean(axis=-1)).mean()
+        last, first = (jax.lax.slice_in_dim(x, 1, None, axis=axis) for x in (weight * confidence, known))
+        both = first & jax.lax.slice_in_dim(known, None, -1, axis=axis)
+        loss = loss + gradient * (last * jnp.abs(step).mean(axis=-1)).mean(where=both)
     return loss
 
 
@@ -217,13 +227,13 @@ def _angle(a: Float[Array, "B S 3 3"], b: Float[Array, "B S 3 3"]) -> Float[Arra
     return jnp.rad2deg(2 * jnp.arcsin(jnp.clip(chord / 8**0.5, 0, 1))).mean()
 
 
-def _depth_error(depth: Float[Array, "B S H W"], truth: Float[Array, "B S H W"]) -> Float[Array, ""]:
+def _depth_error(depth: Float[Array, "B S H W"], truth: Targets) -> Float[Array, ""]:
     """Return the mean absolute relative error after alignment of every clip's medians (of each second pixel)."""
-    depth = jnp.clip(depth, 1e-6, 1e6)  # an untrained head can give any depth
+    depth, right = jnp.clip(depth, 1e-6, 1e6), jnp.where(truth.known, truth.depth, jnp.nan)
     few = np.s_[:, :, ::2, ::2]  # sorting all pixels would take a hundredth of a step
-    ratio = (jnp.log(truth[few]) - jnp.log(depth[few])).reshape(depth.shape[0], -1)
-    scale = jnp.exp(jnp.median(ratio, axis=-1))[:, None, None, None]
-    return (jnp.abs(scale * depth - truth) / truth).mean()
+    ratio = (jnp.log(right[few]) - jnp.log(depth[few])).reshape(depth.shape[0], -1)
+    scale = jnp.exp(jnp.nanmedian(ratio, axis=-1))[:, None, None, None]
+    return jnp.nanmean(jnp.abs(scale * depth - right) / right)
 
 
 def _probe(params: Params, slot: int, tokens: Float[Array, "... E"]) -> Float[Array, "... F"]:
@@ -235,22 +245,23 @@ def _probe(params: Params, slot: int, tokens: Float[Array, "... E"]) -> Float[Ar
 def _probe_terms(taps, truth: Targets, paired: Matches, counts: MatchCounts, patch_size: int) -> dict[str, Array]:
     B, S = truth.depth.shape[:2]
     middle = slice(patch_size // 2, None, patch_size)
-    depth = jnp.log(truth.depth[:, :, middle, middle]).reshape(B, S, -1)
+    known = truth.known[:, :, middle, middle].reshape(B, S, -1)
+    depth = jnp.log(jnp.where(known, truth.depth[:, :, middle, middle].reshape(B, S, -1), 1))
     points = truth.points[:, :, middle, middle].reshape(B, S, -1, 3)
     position = paired.position[:, :, 0]  # [B, R, P, 2]
     visible = paired.visible[:, :, 0][..., None]
     own = paired.position[:, :1, 0]  # of the first frame's patches in the first frame: the patch centres
-    moments, known = _flow_moments(position - own, own, jnp.exp(-depth), visible)
+    moments, enough = _flow_moments(position - own, own, jnp.exp(-depth), visible)
     terms: dict[str, Array] = {name: jnp.zeros(()) for name in ("position", "depth", "points", "camera", "moments")}
     for tap in taps:
         patch, camera = tap["patch_probe"], tap["camera_probe"]
         error = jnp.abs(patch[..., :2] - position) * visible
         terms["position"] += error.sum() / jnp.where(counts.first > 0, 2 * counts.first, 1)
-        terms["depth"] += jnp.abs(patch[..., 2] - depth).mean()
-        terms["points"] += jnp.abs(patch[..., 3:] - points).mean()
+        terms["depth"] += jnp.abs(patch[..., 2] - depth).mean(where=known)
+        terms["points"] += jnp.abs(patch[..., 3:] - points).mean(axis=-1).mean(where=known)
         error = jnp.abs(camera[..., :7] - truth.pose_encoding[..., :7])
         terms["camera"] += error[..., :3].mean() + 5 * error[..., 3:].mean()
-        terms["moments"] += (jnp.abs(camera[..., 7:] - moments).mean(axis=-1) * known).mean()
+        terms["moments"] += (jnp.abs(camera[..., 7:] - moments).mean(axis=-1) * enough).mean()
     return {name: value / len(taps) for name, value in terms.items()}
 
 

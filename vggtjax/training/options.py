@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 from vggtjax.storage.json_values import Count, Positive, check_fields
@@ -17,12 +18,14 @@ class RunOptions:
         checkpoint_seconds: time between checkpoints.
         seconds: time limit, after which the run ends with a checkpoint; the same command resumes it. None is set
             by default.
+        clips: folder for rendered clips of worlds, which runs of equal rows share; by default clips/ in the run's own.
         dtype: of the weights in model.safetensors.
     """
 
     log_every: Count = 50
     checkpoint_seconds: Positive = 600.0
     seconds: Positive | None = None
+    clips: Path | None = None
     dtype: Literal["float32", "bfloat16"] = "float32"
 
     def __post_init__(self) -> None:

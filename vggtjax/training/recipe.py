@@ -26,6 +26,7 @@ from vggtjax.storage.json_values import (
 )
 from vggtjax.training.objective import LossWeights
 from vggtjax.training.scenes.config import SceneConfig, Side
+from vggtjax.training.world.config import WorldConfig
 
 _MOST_FILE_BYTES = 1 << 20
 Decay = Annotated[float, Meta(ge=0, lt=1)]
@@ -60,6 +61,10 @@ class Phase:
     boxes: int = SceneConfig.boxes  # most boxes of a scene; each is present or absent
     ellipsoids: int = SceneConfig.ellipsoids
     cylinders: int = SceneConfig.cylinders
+    worlds: Share = 0.0  # share of steps whose clips are of generated worlds, with the recipe's assets
+    world: WorldConfig = field(default_factory=WorldConfig)
+    reuse: Positive = 4.0  # how often a clip of a world is drawn, roughly
+    masked_movers: Share = 0.6  # share of moving clips of worlds in which the keys of what moves are suppressed
 
     def __post_init__(self) -> None:
         check_fields(self, "phase")
@@ -146,6 +151,7 @@ class Recipe:
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
     losses: LossWeights = field(default_factory=LossWeights)
     start: Start = field(default_factory=Start)
+    assets: str = ""  # folder of textures, photographs and objects, for phases with worlds
     trainable: Literal["all", "heads"] = "all"  # "heads": backbone and aggregator stay unchanged
     untrained: tuple[str, ...] = ("track_head",)  # modules of the model that stay unchanged: those without a loss
     compute_dtype: Literal["auto", "float32", "bfloat16"] = "auto"  # bfloat16 on a GPU, else float32
@@ -172,6 +178,8 @@ class Recipe:
                     f"a phase has frames of {height} x {width} pixels; expected multiples of the "
                     f"model's patch_size {self.model.patch_size}"
                 )
+        if not self.assets and any(phase.worlds for phase in self.stages):
+            raise InputError("a phase has worlds and recipe.assets is empty; expected the folder of their assets")
         new, last = self.start.new_pairs, self.model.depth - 1
         if len(set(new)) < len(new) or any(pair >= last or pair in self.model.taps for pair in new):
             raise InputError(
