@@ -46,13 +46,14 @@ class Worlds:
     def clips(self, step: int) -> PoolClip | None:
         """Return the clips of a step, or None for a step of scenes; those of the next steps are begun."""
         for later in range(max(step, self._asked + 1), min(step + _AHEAD, self._recipe.total_steps)):
-            if (draw := self._draw(later)) is not None:
+            if (draw := self.draw(later)) is not None:
                 self._pool.ask(draw.job, draw.numbers)
             self._asked = later
-        draw = self._draw(step)
+        draw = self.draw(step)
         return None if draw is None else self._pool.clips(*draw)
 
-    def _draw(self, step: int) -> Draw | None:
+    def draw(self, step: int) -> Draw | None:
+        """Return what a step draws; None for a step of scenes."""
         index, phase, frames = draw_shape(self._recipe, step)
         generator = np.random.default_rng((self._recipe.data_seed, step, _STREAM))
         if generator.random() >= phase.worlds:

@@ -146,7 +146,7 @@ def test_samples_of_tiles_and_panoramas():
         (lambda f: (f / "textures/brick_9.png").write_bytes(b"no picture"), "brick_9.png"),
         (lambda f: np.savez(f / "objects/bad9.npz", vertices=np.zeros((3, 2))), "is not an object"),
         (lambda f: (f / "objects/bad9.npz").write_bytes(b"PK nothing"), "bad9.npz"),
-        (lambda f: [path.unlink() for path in (f / "objects").iterdir()], "no objects for training"),
+        (lambda f: [path.unlink() for path in (f / "objects").iterdir()], "no objects at rest for training"),
     ],
 )
 def test_folders_that_are_none_are_refused_in_a_sentence(tmp_path, spoil, words):

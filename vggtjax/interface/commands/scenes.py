@@ -37,18 +37,21 @@ def scenes(
     *,
     count: int = 8,
     images: Annotated[Images, tyro.conf.OmitArgPrefixes] = Images(),
+    assets: Path | None = None,
     kind: Literal["static", "dynamic"] = "dynamic",
     split: Literal["training", "test"] = "training",
     seed: int = 0,
 ) -> None:
-    """Generate clips of rooms with exact depth, masks, parts, flow and cameras; `vggtjax evaluate plain` reads them.
+    """Generate clips with exact depth, masks, parts, flow and cameras; `vggtjax evaluate plain` reads them.
 
     Args:
         out: folder of the set; existing scenes are kept, so the same command resumes an interrupted set.
         count: number of scenes.
         images: how the images are drawn.
+        assets: folder of textures/, photos/ and objects/, for rooms, streets and landscapes of these instead of rooms
+            of simple shapes; of the images, frames, height and width are then read.
         kind: "static", or "dynamic" where one to three objects move, not always in view.
-        split: of the textures; the two splits share no pixels of a photograph.
+        split: of the textures, and of the assets; the two splits share no pixels of a photograph.
         seed: another seed draws other scenes.
     """
     report = Report()
@@ -59,7 +62,13 @@ def scenes(
 
             config = SceneConfig(**asdict(images))
         with report.stage("generate") as progress:
-            folders = write_scenes(out, config, count=count, kind=kind, split=split, seed=seed, progress=progress)
+            chosen = {"count": count, "kind": kind, "split": split, "seed": seed}
+            if assets is None:
+                folders = write_scenes(out, config, **chosen, progress=progress)
+            else:
+                from vggtjax.training.world.dataset import write_worlds
+
+                folders = write_worlds(out, assets, config, **chosen, progress=progress)
     report.table(
         {
             "scenes": f"{len(folders)} of {images.frames} frames of {images.width} x {images.height} pixels, {kind}",

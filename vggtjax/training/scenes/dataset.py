@@ -4,7 +4,7 @@ In the folder:
 
     index.json              conventions, files, settings, and the complete scenes
     preview.png             an overview of some scenes
-    scene_0000/             a scene, renamed into place when complete: `_FILES`, named by frame number
+    scene_0000/             a scene, renamed into place when complete: `FILES`, named by frame number
 """
 
 from __future__ import annotations
@@ -12,13 +12,15 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, NamedTuple, get_args
 
 import jax
 import numpy as np
+from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 
 from vggtjax.cameras import world_from_camera
@@ -37,6 +39,7 @@ from vggtjax.training.scenes.textures import Split, load_textures
 INDEX, PREVIEW = "index.json", "preview.png"
 _MOST_SCENES = 10_000
 _FORMAT_VERSION = 1
+MARKS = {"format": "vggtjax scenes", "version": _FORMAT_VERSION}  # of an index
 _LATER = {"pitch": [0.0, 0.0], "roll": 0.0}  # as in sets before these fields
 _STREAM = 0x73657473  # folded into the seed's key, so that no other use of a seed draws these scenes
 _MILLIMETRES = 1000.0
@@ -44,14 +47,14 @@ _PNG_LEVEL = 3  # zlib's; higher ones take several times as long for a few perce
 _WORKERS = 8
 _INDEX_BYTES = 2**22
 
-_CONVENTIONS = {
+CONVENTIONS = {
     "units": "metres",
     "camera": "OpenCV: x right, y down, z forward; intrinsics in pixels, principal point at the image centre",
     "pixels": "the centre of the first pixel is at (0.5, 0.5); truth is that of the pixel's centre",
     "world": "axes of the scene, y down; the room is at rest in it",
     "parts": "0 is the room; every rigid part has a number, and every pixel shows one",
 }
-_FILES = {
+FILES = {
     "images/*.png": "RGB, 8 bits",
     "depth/*.npy": "float32 [H, W], metres along z",
     "depth/*.png": "uint16, the same in millimetres",
@@ -65,6 +68,19 @@ _FILES = {
 }
 
 _draw = jax.jit(generate, static_argnums=2)
+
+
+class SceneFiles(NamedTuple):
+    """What the folder of a scene holds. Metres; depth is 0 in the sky."""
+
+    images: UInt8[np.ndarray, "S H W 3"]
+    depth: Float[np.ndarray, "S H W"]
+    dynamic_mask: Bool[np.ndarray, "S H W"]
+    parts: UInt8[np.ndarray, "S H W"]
+    scene_flow: Float[np.ndarray, "S H W 3"]
+    camera_from_world: Float[np.ndarray, "S 3 4"]
+    intrinsics: Float[np.ndarray, "S 3 3"]
+    world_from_part: Float[np.ndarray, "S K 3 4"] | None  # None where parts are not rigid
 
 
 def write_scenes(
@@ -98,26 +114,50 @@ def write_scenes(
         OutputError: the folder cannot be written, or holds scenes or a preview without an index.
     """
     out = Path(out)
-    _check(config, count, kind, seed)
+    check_set(count, seed)
+    check_choice("kind", kind, get_args(Kind))
+    if (config.shutter > 0) != (config.exposures > 1):
+        raise InputError(
+            f"shutter is {config.shutter} with {config.exposures} exposures; motion blur needs a shutter above 0 and "
+            "at least 2 exposures, sharp images a shutter of 0 and 1"
+        )
     textures = load_textures(split)
     config = dataclasses.replace(config, dynamic=float(kind == "dynamic"))
     index = _describe(config, kind, split, seed)
-    _check_folder(out, index)
     stream = jax.random.fold_in(jax.random.key(seed), _STREAM)
+
+    def draw(number: int) -> SceneFiles:
+        return _files_of(jax.device_get(_draw(jax.random.fold_in(stream, number), textures, config)))
+
+    return write_set(out, index, count, draw, f"{kind} scenes, seed {seed}, {split} textures", progress)
+
+
+def write_set(
+    out: Path,
+    index: dict[str, Any],
+    count: int,
+    draw: Callable[[int], SceneFiles],
+    title: str,
+    progress: Progress | None = None,
+) -> list[Path]:
+    """Write the scenes that `draw` gives by number, with an index and a preview; existing scenes are kept.
+
+    Raises InputError and OutputError as `write_scenes` does.
+    """
+    _check_folder(out, index)
     folders = [out / f"scene_{number:04d}" for number in range(count)]
     _write_index(out, index)  # first, so that no scene is ever without an index
     missing = [number for number in range(count) if not folders[number].is_dir()]
     for done, number in enumerate(missing, start=count - len(missing)):
         (progress or no_progress)(done, count)
-        clip = jax.device_get(_draw(jax.random.fold_in(stream, number), textures, config))
         with staging(out) as staged:
             scene = staged / "scene"
             scene.mkdir()
-            _write_scene(scene, clip)
+            _write_scene(scene, draw(number))
             scene.rename(folders[number])
         _write_index(out, index)
     with writing(out / PREVIEW) as path:
-        draw_sheet(folders, f"{kind} scenes, seed {seed}, {split} textures").save(path)
+        draw_sheet(folders, title).save(path)
     (progress or no_progress)(count, count)
     return folders
 
@@ -133,17 +173,12 @@ def read_index(out: str | Path) -> dict[str, Any]:
     return index
 
 
-def _check(config: SceneConfig, count: int, kind: str, seed: int) -> None:
-    check_choice("kind", kind, get_args(Kind))
+def check_set(count: int, seed: int) -> None:
+    """Raise InputError for a number of scenes or a seed out of range."""
     if type(count) is not int or not 1 <= count <= _MOST_SCENES:
         raise InputError(f"count is {count!r}; expected a whole number from 1 to {_MOST_SCENES}")
     if type(seed) is not int or not 0 <= seed < 2**31:
         raise InputError(f"seed is {seed!r}; expected a whole number in [0, 2**31)")
-    if (config.shutter > 0) != (config.exposures > 1):
-        raise InputError(
-            f"shutter is {config.shutter} with {config.exposures} exposures; motion blur needs a shutter above 0 and "
-            "at least 2 exposures, sharp images a shutter of 0 and 1"
-        )
 
 
 def _check_folder(out: Path, index: dict[str, Any]) -> None:
@@ -154,7 +189,7 @@ def _check_folder(out: Path, index: dict[str, Any]) -> None:
             raise OutputError(f"{leftovers[0]} exists without {INDEX} beside it; choose another folder or move it away")
         return
     existing = read_index(out)
-    if isinstance(existing.get("config"), dict):
+    if isinstance(existing.get("config"), dict) and _LATER.keys() <= index["config"].keys():
         existing["config"] = _LATER | existing["config"]
     other = [name for name in ("kind", "split", "seed", "config") if existing.get(name) != index[name]]
     if other:
@@ -173,11 +208,10 @@ def _difference(name: str, there: Any, wanted: Any) -> str:
 def _describe(config: SceneConfig, kind: str, split: str, seed: int) -> dict[str, Any]:
     """Return the index of a set without its scenes."""
     return {
-        "format": "vggtjax scenes",
-        "version": _FORMAT_VERSION,
+        **MARKS,
         "about": "Generated rooms in which things stand or move, seen by a hand-held camera, with exact truth.",
-        "conventions": _CONVENTIONS,
-        "files": _FILES,
+        "conventions": CONVENTIONS,
+        "files": FILES,
         "kind": kind,
         "split": split,
         "seed": seed,
@@ -195,26 +229,33 @@ def _write_index(out: Path, index: dict[str, Any]) -> None:
         path.write_text(json.dumps(index, indent=2) + "\n", encoding="utf-8")
 
 
-def _write_scene(folder: Path, clip: SyntheticClip) -> None:
-    """Write a clip [S, ...] of numpy arrays into the empty `folder`."""
+def _files_of(clip: SyntheticClip) -> SceneFiles:
+    pictures = np.rint(255 * clip.images).astype(np.uint8)
+    parts, cameras = np.asarray(clip.part_ids, np.uint8), (clip.camera_from_world, clip.intrinsics)
+    return SceneFiles(pictures, clip.depth, clip.dynamic_mask, parts, clip.scene_flow, *cameras, clip.world_from_part)  # pyright: ignore
+
+
+def _write_scene(folder: Path, clip: SceneFiles) -> None:
+    """Write a scene into the empty `folder`."""
     S, H, W = clip.depth.shape
     poses = world_from_camera(np.asarray(clip.camera_from_world))
     write_trajectory(folder / "trajectory.txt", poses, np.arange(S, dtype=np.float64))
     write_intrinsics(folder / "intrinsics.txt", list(np.asarray(clip.intrinsics)), [(H, W)] * S)
-    np.save(folder / "part_poses.npy", np.asarray(clip.world_from_part, np.float32), allow_pickle=False)
+    if clip.world_from_part is not None:
+        np.save(folder / "part_poses.npy", np.asarray(clip.world_from_part, np.float32), allow_pickle=False)
     for name in ("images", "depth", "mask", "parts", "flow"):
         (folder / name).mkdir()
     with ThreadPoolExecutor(min(_WORKERS, os.cpu_count() or 1)) as pool:
         list(pool.map(partial(_write_frame, folder, clip), range(S)))
 
 
-def _write_frame(folder: Path, clip: SyntheticClip, frame: int) -> None:
+def _write_frame(folder: Path, clip: SceneFiles, frame: int) -> None:
     depth = np.asarray(clip.depth[frame])
     pictures = {
-        "images": np.rint(255 * clip.images[frame]).astype(np.uint8),
+        "images": clip.images[frame],
         "depth": encode_depth(depth, depth > 0, _MILLIMETRES),
         "mask": np.uint8(255) * clip.dynamic_mask[frame],
-        "parts": np.asarray(clip.part_ids[frame], np.uint8),
+        "parts": clip.parts[frame],
     }
     for name, pixels in pictures.items():
         Image.fromarray(pixels).save(folder / name / f"{frame:05d}.png", compress_level=_PNG_LEVEL)

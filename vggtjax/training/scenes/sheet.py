@@ -46,7 +46,7 @@ def _row(scene: Path) -> list[np.ndarray]:
     middle = names[len(names) // 2]
     images = [_pixels(scene / f"images/{name}.png") for name in (names[0], middle, names[-1])]
     depth = np.load(scene / f"depth/{middle}.npy", allow_pickle=False)
-    valid = np.ones(depth.shape, bool)
+    valid = depth > 0
     mask, parts = _pixels(scene / f"mask/{middle}.png") > 0, _pixels(scene / f"parts/{middle}.png")
     return [
         *images,

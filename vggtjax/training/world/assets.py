@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from math import prod
 from pathlib import Path
 from typing import NamedTuple
@@ -101,12 +101,15 @@ def read_assets(folder: str | Path, split: Split = "training") -> Assets:
 
 @functools.lru_cache(maxsize=2)
 def _read(folder: Path, split: Split) -> Assets:
-    pictures = _of_split(_files(folder / "textures", _SUFFIXES), split)
-    photos = _of_split(_files(folder / "photos", _SUFFIXES), split, places=True)
+    pictures = _of_split(_files(folder / "textures", _SUFFIXES), split, _material, _stem)
+    photos = _of_split(_files(folder / "photos", _SUFFIXES), split, lambda _: "", _place)
     panoramas = [path for path in photos if path.name.startswith("pano_")]
     photos = [path for path in photos if not path.name.startswith("pano_")]
-    meshes = {path.stem: _arrays(path) for path in _of_split(_files(folder / "objects", {".npz"}), split)}
-    for name, found in (("textures", pictures), ("photos", photos), ("pano_* photos", panoramas), ("objects", meshes)):
+    meshes = _of_split(_files(folder / "objects", {".npz"}), split, _gait, _stem)
+    meshes = {path.stem: _arrays(path) for path in meshes}
+    still = [name for name in meshes if not name.startswith("anim_")]
+    kinds = ("textures", pictures), ("photos", photos), ("pano_* photos", panoramas), ("objects at rest", still)
+    for name, found in kinds:
         if not found:
             raise InputError(f"{folder} has no {name} for {split}; expected at least {_TEST} files of each kind")
     images = [_square(read_image(path)) for path in (*pictures, *photos)]
@@ -167,18 +170,19 @@ def _files(folder: Path, suffixes: Iterable[str]) -> list[Path]:
     return files
 
 
-def _of_split(files: list[Path], split: Split, *, places: bool = False) -> list[Path]:
-    """Return every fifth file of each material for test scenes, the others for training; of photographs, places."""
+def _of_split(
+    files: list[Path], split: Split, group: Callable[[Path], str], member: Callable[[Path], str]
+) -> list[Path]:
+    """Return every fifth member of each group for test scenes, the others for training."""
     groups: dict[str, dict[str, list[Path]]] = {}
     for path in files:
-        group, member = ("", _place(path)) if places else (_material(path), path.stem)
-        groups.setdefault(group, {}).setdefault(member, []).append(path)
+        groups.setdefault(group(path), {}).setdefault(member(path), []).append(path)
     chosen = (
         path
-        for group in groups.values()
-        for index, name in enumerate(sorted(group))
+        for members in groups.values()
+        for index, name in enumerate(sorted(members))
         if (index % _TEST == _TEST - 1) == (split == "test")
-        for path in group[name]
+        for path in members[name]
     )
     return sorted(chosen)
 
@@ -186,6 +190,14 @@ def _of_split(files: list[Path], split: Split, *, places: bool = False) -> list[
 def _place(path: Path) -> str:
     """Return the place that a photograph shows: views and panorama of one place are of one split."""
     return re.sub(r"^(hdri|pano)_|_\d+$", "", path.stem)
+
+
+def _stem(path: Path) -> str:
+    return path.stem
+
+
+def _gait(path: Path) -> str:
+    return "moves" if path.stem.startswith("anim_") else "still"
 
 
 def _material(path: Path) -> str:

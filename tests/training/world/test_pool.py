@@ -1,0 +1,124 @@
+"""Clips of worlds in a run: drawn by step, kept in a folder, the same after an interruption."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.shared.asset_folder import write_assets
+from tests.shared.training_runs import PROBES, init_probes, make_batch, objective, same
+from vggtjax.errors import InputError
+from vggtjax.training.data import make_world_batch
+from vggtjax.training.loop import Task, train
+from vggtjax.training.options import RunOptions
+from vggtjax.training.recipe import Phase
+from vggtjax.training.scenes.config import SceneConfig
+from vggtjax.training.world.config import Places, WorldConfig
+from vggtjax.training.world.dataset import write_worlds
+from vggtjax.training.world.pool import ClipPool, Job
+from vggtjax.training.worlds import Worlds, opened_worlds
+
+ROOMS = WorldConfig(places=Places(1, 0, 0), dynamic=1.0)
+PHASE = Phase(4, 2, (2, 3), 28, 28, worlds=0.7, world=ROOMS, suppressed=0.5, masked_movers=1.0)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return write_assets(tmp_path_factory.mktemp("assets") / "assets")
+
+
+@pytest.fixture(scope="module")
+def clips(folder, tmp_path_factory):
+    """Two clips of a pool, the first in order, the second backwards."""
+    with ClipPool(tmp_path_factory.mktemp("clips"), [Job(str(folder), ROOMS, 3, 28, 28, 14, 0)]) as pool:
+        return pool.clips(0, [0, 1], [np.arange(3), np.arange(3)[::-1]])
+
+
+def recipe_of(folder):
+    return dataclasses.replace(PROBES, stages=(PHASE,), assets=str(folder))
+
+
+def world_images(key, clips, phase, frames, patch_size):
+    """The pictures alone, as the small objective of these tests takes them."""
+    del key, phase, frames, patch_size
+    return jnp.asarray(clips.images, jnp.float32) / 255
+
+
+def test_an_interrupted_run_draws_the_same_clips(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr("vggtjax.training.run.plot", lambda *_: None)
+    recipe, seen = recipe_of(folder), []
+
+    def noted(key, clips, *shape):
+        seen.append(clips.images.shape)
+        return world_images(key, clips, *shape)
+
+    task = Task(jnp.float32(1), make_batch, init_probes, objective, noted)
+    kept = RunOptions(clips=tmp_path / "clips")
+    whole = train(recipe, tmp_path / "whole", options=kept, task=task)
+    assert seen
+    out = tmp_path / "parts"
+    for _ in range(4):
+        outcome = train(recipe, out, options=dataclasses.replace(kept, seconds=1e-9), task=task)
+    assert outcome.finished
+    assert same(outcome.state, whole.state)
+    assert not (out / "clips").exists()
+
+
+def test_the_pool_grows_and_every_step_has_its_own_draw(folder, tmp_path):
+    recipe = recipe_of(folder)
+    with opened_worlds(dataclasses.replace(recipe, assets=str(folder)), tmp_path) as worlds:
+        assert isinstance(worlds, Worlds)
+        draws = [worlds.draw(step) for step in range(400)]
+    assert 0.6 < np.mean([draw is not None for draw in draws]) < 0.8
+    numbers = [draw.numbers for draw in draws if draw is not None]
+    assert max(numbers[0]) < max(max(row) for row in numbers)
+    assert all(len(set(row)) == PHASE.batch for row in numbers)
+    orders = {tuple(frames) for draw in draws if draw is not None for frames in draw.frames}
+    assert {(0, 1, 2), (2, 1, 0), (0, 2), (1, 0)} <= orders
+
+
+def test_frames_are_taken_in_the_order_that_is_asked_for(clips, folder, tmp_path):
+    with ClipPool(tmp_path, [Job(str(folder), ROOMS, 3, 28, 28, 14, 0)]) as pool:
+        forward = pool.clips(0, [1], [np.arange(3)])
+        path = next(tmp_path.rglob("*.npz"))
+        path.write_bytes(path.read_bytes()[:1000])  # cut off: made anew
+        again = pool.clips(0, [1], [np.arange(3)])
+    for name, backward in clips._asdict().items():
+        one = getattr(forward, name)[0][::-1]
+        np.testing.assert_array_equal(one[:, :, ::-1] if name == "tracks" else one, backward[1])
+        np.testing.assert_array_equal(getattr(forward, name), getattr(again, name))
+
+
+def test_keys_of_what_moves_are_suppressed(clips):
+    make = jax.jit(make_world_batch, static_argnums=(2, 3, 4))
+    batch = make(jax.random.key(0), clips, PHASE, 3, 14)
+    np.testing.assert_array_equal(batch.regions, clips.moving)
+    never = make(jax.random.key(0), clips, dataclasses.replace(PHASE, masked_movers=0.0), 3, 14)
+    assert not never.regions.any()
+    assert batch.clips.images.min() >= 0
+    assert batch.clips.images.max() <= 1
+
+
+def test_a_set_of_worlds_is_read_by_evaluate(folder, tmp_path):
+    from vggtjax.research.evaluation.datasets import find_sequences
+
+    size = SceneConfig(height=32, width=48, frames=3)
+    made = write_worlds(tmp_path / "set", folder, size, count=2, seed=1)
+    sequences = find_sequences("plain", tmp_path / "set", strict=True)
+    assert len(sequences) == len(made) == 2
+    sequence = next(iter(sequences.values()))()
+    assert sequence.depth is not None
+    assert len(sequence) == 3
+    assert sequence.depth(0).shape == (32, 48)
+    with pytest.raises(InputError, match="height of config 32 instead of 40;"):
+        write_worlds(tmp_path / "set", folder, dataclasses.replace(size, height=40), count=2, seed=1)
+
+
+def test_recipes_that_cannot_be_drawn_are_refused(folder, tmp_path):
+    with pytest.raises(InputError, match="expected the folder of their assets"):
+        dataclasses.replace(PROBES, stages=(PHASE,))
+    missing = dataclasses.replace(recipe_of(folder), assets=str(tmp_path / "nowhere"))
+    with pytest.raises(InputError, match="is not a folder"):
+        train(missing, tmp_path / "out", task=Task(jnp.float32(1), make_batch, init_probes, objective, world_images))

@@ -1,0 +1,80 @@
+"""Write clips of worlds as a data set, in the layout of `vggtjax.training.scenes.dataset`."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+
+from vggtjax.progress import Progress
+from vggtjax.training.scenes.config import SceneConfig
+from vggtjax.training.scenes.dataset import CONVENTIONS, FILES, MARKS, SceneFiles, check_set, write_set
+from vggtjax.training.scenes.held_out import Kind
+from vggtjax.training.scenes.textures import Split
+from vggtjax.training.world.assets import read_assets
+from vggtjax.training.world.clip import world_clip
+from vggtjax.training.world.config import WorldConfig
+
+_STREAM = 0x776F7264  # beside a seed, so that no clip of a training run is drawn
+_PARTS = "0 stands still, 255 is sky, where depth is 0; what moves has its number from 1"
+_PATCH = 8  # the tracks of patches are not written
+
+
+def write_worlds(
+    out: str | Path,
+    assets: str | Path,
+    size: SceneConfig,
+    config: WorldConfig | None = None,
+    *,
+    count: int,
+    kind: Kind = "dynamic",
+    split: Split = "training",
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> list[Path]:
+    """Generate clips of worlds into a folder; existing ones are kept, so the same call resumes an interrupted set.
+
+    Args:
+        out: folder of the set, made if missing.
+        assets: folder of textures, photographs and objects; see `vggtjax.training.world.assets`.
+        size: height, width and frames of the clips; its other fields are not read.
+        config: what is drawn; `kind` replaces its `dynamic`.
+        count: number of clips, at most 10 000.
+        kind: "static", or "dynamic" where one to four things move.
+        split: of the assets.
+        seed: different seeds share no clip.
+        progress: called with the number of complete clips and `count`.
+
+    Returns:
+        The folders of the clips.
+
+    Raises:
+        InputError: a value out of range, no folder of assets, or a folder with a set of other settings.
+        OutputError: the folder cannot be written, or holds scenes or a preview without an index.
+    """
+    out, found = Path(out), read_assets(assets, split)
+    check_set(count, seed)
+    config = dataclasses.replace(config or WorldConfig(), dynamic=float(kind == "dynamic"))
+    frames, height, width = size.frames, size.height, size.width
+    drawn = {"frames": frames, "height": height, "width": width, "world": dataclasses.asdict(config)}
+    index = {
+        **MARKS,
+        "about": "Generated rooms, streets and landscapes in which things stand or move, with exact truth.",
+        "conventions": {**CONVENTIONS, "world": "axes of the scene, z up", "parts": _PARTS},
+        "files": {name: about for name, about in FILES.items() if name != "part_poses.npy"},
+        "kind": kind,
+        "split": split,
+        "seed": seed,
+        "config": json.loads(json.dumps(drawn)),
+    }
+
+    def draw(number: int) -> SceneFiles:
+        shape = {"frames": frames, "height": height, "width": width, "patch": _PATCH}
+        clip = world_clip(found, config, (seed, _STREAM, number), **shape)
+        intrinsics = np.broadcast_to(clip.intrinsics, (frames, 3, 3))
+        truth = clip.dynamic_mask, clip.object_ids, clip.scene_flow, clip.camera_from_world, intrinsics
+        return SceneFiles(clip.images, clip.depth, *truth, None)
+
+    return write_set(out, index, count, draw, f"{kind} worlds, seed {seed}, {split} assets", progress)
