@@ -34,12 +34,13 @@ def _picture(path: Path, generator: np.random.Generator, size: tuple[int, int]) 
 
 def _object(path: Path, generator: np.random.Generator, size, poses: int = 0) -> None:
     mesh = trimesh.creation.box(extents=size)
-    vertices = np.asarray(mesh.vertices, np.float32) + np.float32([0, 0, size[2] / 2])
+    vertices = np.asarray(mesh.vertices, np.float32) + np.asarray([0, 0, size[2] / 2], np.float32)
     if poses:  # a figure that bends forth and back
         lean = 0.2 * np.sin(2 * np.pi * np.arange(poses) / poses)[:, None]
         vertices = np.repeat(vertices[None], poses, axis=0)
         vertices[..., 1] += lean * vertices[..., 2]
     uv = generator.random((len(mesh.vertices), 2)).astype(np.float32)
     texture = generator.integers(0, 256, (16, 16, 3)).astype(np.uint8)
-    extra = {"fps": np.float32(8)} if poses else {}
-    np.savez(path, vertices=vertices, faces=np.asarray(mesh.faces, np.int32), uv=uv, texture=texture, **extra)
+    arrays = {"vertices": vertices, "faces": np.asarray(mesh.faces, np.int32), "uv": uv, "texture": texture}
+    arrays |= {"fps": np.float32(8)} if poses else {}
+    np.savez(path, allow_pickle=False, **arrays)

@@ -10,6 +10,7 @@ import pytest
 from tests.shared.generated import DYNAMIC, QUICK, clips
 from vggtjax.network.heads.pose import decode_pose
 from vggtjax.training.matching import MatchLoss, match_loss
+from vggtjax.training.objective import dense_loss
 from vggtjax.training.scenes import SyntheticClip
 from vggtjax.training.truth import OCCLUDED, Matches, clips_of, match_counts, matches, targets
 
@@ -216,3 +217,31 @@ def test_the_loss_of_layers_is_the_mean_of_those_that_are_supervised():
         sums = loss.add(sums, supervised, q[layer], k[layer])
     expected = np.mean([slow_match_loss(found, q[layer, :, :, 1:], k[layer, :, :, 1:]) for layer in (1, 3)], axis=0)
     assert [float(x) for x in sums] == pytest.approx(expected, rel=1e-5)
+
+
+def test_the_sky_has_no_part_in_losses_and_matches():
+    """Depth 0 in the upper half: the same loss, scale and matches, whatever is predicted there."""
+    scenes = passage()
+    clips = clips_of(scenes, PATCH)
+    sky = clips._replace(depth=clips.depth.at[:, :, :8].set(0))
+    truth = targets(sky)
+    assert not truth.known[:, :, :8].any()
+    below = np.linalg.norm(np.asarray(truth.points)[:, :, 8:], axis=-1)
+    np.testing.assert_allclose(below.mean(), 1, atol=1e-5)
+    seen = np.asarray(matches(sky, PATCH).visible).reshape(3, 3, 4, 4)
+    assert not seen[:, :, :2].any()
+    assert seen[:, :, 3].all()
+    alone = targets(clips._replace(depth=jnp.zeros_like(clips.depth)))
+    assert jnp.isfinite(alone.pose_encoding).all()
+
+
+def test_dense_loss_by_hand():
+    """Two equal rows of four pixels, the last of which is sky; errors count by their weight, with their gradient."""
+    truth, values = jnp.asarray([1.0, 2.0, 4.0, 0.0]), jnp.asarray([1.5, 2.0, 3.0, 50.0])
+    confidence, weight = jnp.asarray([1.0, 2.0, 1.0, 9.0]), jnp.asarray([1.0, 0.5, 0.25, 0.0])
+    shaped = [jnp.broadcast_to(x, (1, 1, 2, 4)) for x in (values, confidence, truth, weight)]
+    loss = dense_loss(shaped[0][..., None], shaped[1], shaped[2][..., None], 0.0, shaped[3])
+    expected = (0.5 + 0 + 0.25 - 0.2 * np.log(2)) / 3
+    assert float(loss) == pytest.approx(expected, rel=1e-6)
+    with_slope = dense_loss(shaped[0][..., None], shaped[1], shaped[2][..., None], 1.0, shaped[3])
+    assert float(with_slope) == pytest.approx(expected + (1.0 * 0.5 + 0.25 * 1.0) / 2, rel=1e-6)

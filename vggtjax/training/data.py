@@ -54,7 +54,8 @@ def make_world_batch(key: Array, clips: PoolClip, phase: Phase, frames: int, pat
     those of random regions are, as in scenes. Pure; `phase`, `frames` and `patch_size` are static.
     """
     del patch_size
-    moves = clips.moving.any(axis=(1, 2, 3))
+    moving = jnp.asarray(clips.moving)
+    moves = moving.any(axis=(1, 2, 3))
 
     def one(key: Array, images: Array, moving: Array, moves: Array) -> tuple[Array, Array]:
         _, order_key, colour_key = jax.random.split(key, 3)
@@ -62,9 +63,9 @@ def make_world_batch(key: Array, clips: PoolClip, phase: Phase, frames: int, pat
         images = _recolour(colour_key, images.astype(jnp.float32) / 255, phase.gamma)
         return images, jnp.where(masked, moving, _regions(key, phase, frames) & ~moves)
 
-    images, regions = jax.vmap(one)(jax.random.split(key, phase.batch), clips.images, clips.moving, moves)
-    depth = clips.depth.astype(jnp.float32)
-    seen = Clips(images, depth, clips.camera_from_world, clips.intrinsics, clips.tracks)
+    images, regions = jax.vmap(one)(jax.random.split(key, phase.batch), jnp.asarray(clips.images), moving, moves)
+    truth = clips.camera_from_world, clips.intrinsics, clips.tracks
+    seen = Clips(images, *(jnp.asarray(values, jnp.float32) for values in (clips.depth, *truth)))
     return _suppressing(key, phase, seen, regions)
 
 

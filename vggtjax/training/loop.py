@@ -120,7 +120,10 @@ def train(
         run = Run(recipe, Path(out), task.init_probes(recipe.seed, recipe.model), params, labels, options)
         pace = _Pace(run, progress)
         pace.report()
-        with _signals() as received, opened_worlds(recipe, options.clips or Path(out) / "clips") as worlds:
+        with (
+            _signals() as received,
+            opened_worlds(recipe, options.clips or Path(out) / "clips", options.renderers) as worlds,
+        ):
             trainer = _Trainer(run, task, worlds)
             while run.step < recipe.total_steps:
                 trainer.step()

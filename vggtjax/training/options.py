@@ -19,6 +19,7 @@ class RunOptions:
         seconds: time limit, after which the run ends with a checkpoint; the same command resumes it. None is set
             by default.
         clips: folder for rendered clips of worlds, which runs of equal rows share; by default clips/ in the run's own.
+        renderers: processes that render clips of worlds.
         dtype: of the weights in model.safetensors.
     """
 
@@ -26,6 +27,7 @@ class RunOptions:
     checkpoint_seconds: Positive = 600.0
     seconds: Positive | None = None
     clips: Path | None = None
+    renderers: Count = 1
     dtype: Literal["float32", "bfloat16"] = "float32"
 
     def __post_init__(self) -> None:

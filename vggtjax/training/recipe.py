@@ -63,7 +63,7 @@ class Phase:
     cylinders: int = SceneConfig.cylinders
     worlds: Share = 0.0  # share of steps whose clips are of generated worlds, with the recipe's assets
     world: WorldConfig = field(default_factory=WorldConfig)
-    reuse: Positive = 4.0  # how often a clip of a world is drawn, roughly
+    reuse: Positive = 4.0  # how often a clip of a world is drawn, on average
     masked_movers: Share = 0.6  # share of moving clips of worlds in which the keys of what moves are suppressed
 
     def __post_init__(self) -> None:

@@ -85,7 +85,8 @@ def targets(clips: Clips) -> Targets:
     camera_from_first = compose(clips.camera_from_world, invert(clips.camera_from_world[:, :1]))
     points = unproject(clips.depth, clips.intrinsics, camera_from_first, pixel_offset=0.5)
     distance = jnp.linalg.norm(points, axis=-1)
-    scale = distance.mean(axis=(1, 2, 3), where=known)  # [B]
+    scale = distance.sum(axis=(1, 2, 3), where=known) / jnp.maximum(known.sum(axis=(1, 2, 3)), 1)  # [B]
+    scale = jnp.where(scale > 0, scale, 1)  # a clip of the sky alone
     translation = camera_from_first[..., 3:] / scale[:, None, None, None]
     camera = jnp.concatenate([camera_from_first[..., :3], translation], axis=-1)
     return Targets(

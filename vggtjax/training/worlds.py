@@ -14,6 +14,7 @@ from vggtjax.training.recipe import Phase, Recipe
 from vggtjax.training.world.pool import ClipPool, Job, PoolClip
 
 _FIRST = 16  # clips of each size in the pool of the first step
+_WINDOW = 256  # of the newest clips of a size the clips of a step are drawn
 _AHEAD = 24  # steps whose clips are rendered before they come
 _STREAM = 1  # of the draws of clips, beside those of sizes
 
@@ -59,15 +60,26 @@ class Worlds:
         if generator.random() >= phase.worlds:
             return None
         job = _job(self._recipe, index, phase)
-        sizes = len(self._recipe.stages[index].all_sizes)
-        there = _FIRST + int(step * phase.batch * phase.worlds / phase.reuse / sizes)
-        numbers = [int(number) for number in generator.choice(there, phase.batch, replace=False)]
+        available = self._available(job, step, phase.batch)
+        newest = min(available, max(_WINDOW, 2 * phase.batch))
+        numbers = available - 1 - generator.choice(newest, phase.batch, replace=False)
         chosen = [_frames(generator, job.frames, frames) for _ in numbers]
-        return Draw(self._jobs.index(job), numbers, chosen)
+        return Draw(self._jobs.index(job), numbers.tolist(), chosen)
+
+    def _available(self, job: Job, step: int, batch: int) -> int:
+        """Return how many clips of a job the pool has at a step: some at its start, then more with every step."""
+        rendered, start = 0.0, 0
+        for index, phase in enumerate(self._recipe.stages):
+            sizes = [_job(self._recipe, index, phase.of_size(size)) for size in range(len(phase.all_sizes))]
+            if phase.worlds and job in sizes:
+                steps = min(max(step - start, 0), phase.steps)
+                rendered += steps * phase.batch * phase.worlds / phase.reuse / len(sizes)
+            start += phase.steps
+        return max(_FIRST, 2 * batch) + int(rendered)
 
 
 @contextmanager
-def opened_worlds(recipe: Recipe, folder: Path) -> Iterator[Worlds | None]:
+def opened_worlds(recipe: Recipe, folder: Path, renderers: int = 1) -> Iterator[Worlds | None]:
     """Yield the worlds of a recipe, with a pool in `folder`; None for a recipe without worlds.
 
     Raises InputError where the recipe's assets are not a folder of assets.
@@ -78,7 +90,7 @@ def opened_worlds(recipe: Recipe, folder: Path) -> Iterator[Worlds | None]:
         yield None
         return
     jobs = list(dict.fromkeys(jobs))
-    with ClipPool(folder, jobs) as pool:
+    with ClipPool(folder, jobs, renderers) as pool:
         yield Worlds(recipe, pool, jobs)
 
 
@@ -88,10 +100,10 @@ def _job(recipe: Recipe, index: int, phase: Phase) -> Job:
     return Job(recipe.assets, phase.world, *size, recipe.data_seed)
 
 
-def _frames(generator: np.random.Generator, there: int, count: int) -> np.ndarray:
+def _frames(generator: np.random.Generator, available: int, count: int) -> np.ndarray:
     """Return frames of a clip, evenly apart, forward or backward in time; in half of the clips in random order."""
-    apart = int(generator.integers(1, max((there - 1) // max(count - 1, 1), 1) + 1))
-    first = int(generator.integers(0, there - apart * (count - 1)))
+    apart = int(generator.integers(1, max((available - 1) // max(count - 1, 1), 1) + 1))
+    first = int(generator.integers(0, available - apart * (count - 1)))
     frames = first + apart * np.arange(count)
     if generator.random() >= IN_ORDER:
         return generator.permutation(frames)

@@ -9,7 +9,7 @@ import pytest
 
 from tests.shared.asset_folder import write_assets
 from tests.shared.training_runs import PROBES, init_probes, make_batch, objective, same
-from vggtjax.errors import InputError
+from vggtjax.errors import InputError, VggtjaxError
 from vggtjax.training.data import make_world_batch
 from vggtjax.training.loop import Task, train
 from vggtjax.training.options import RunOptions
@@ -55,15 +55,12 @@ def test_an_interrupted_run_draws_the_same_clips(folder, tmp_path, monkeypatch):
         return world_images(key, clips, *shape)
 
     task = Task(jnp.float32(1), make_batch, init_probes, objective, noted)
-    kept = RunOptions(clips=tmp_path / "clips")
-    whole = train(recipe, tmp_path / "whole", options=kept, task=task)
+    whole = train(recipe, tmp_path / "whole", task=task)
     assert seen
     out = tmp_path / "parts"
-    for _ in range(4):
-        outcome = train(recipe, out, options=dataclasses.replace(kept, seconds=1e-9), task=task)
+    outcome = [train(recipe, out, options=RunOptions(seconds=1e-9), task=task) for _ in range(4)][-1]
     assert outcome.finished
     assert same(outcome.state, whole.state)
-    assert not (out / "clips").exists()
 
 
 def test_the_pool_grows_and_every_step_has_its_own_draw(folder, tmp_path):
@@ -77,6 +74,28 @@ def test_the_pool_grows_and_every_step_has_its_own_draw(folder, tmp_path):
     assert all(len(set(row)) == PHASE.batch for row in numbers)
     orders = {tuple(frames) for draw in draws if draw is not None for frames in draw.frames}
     assert {(0, 1, 2), (2, 1, 0), (0, 2), (1, 0)} <= orders
+
+
+def test_pools_of_phases_grow_by_their_own_steps(folder, tmp_path):
+    """A second phase of another size begins with as few clips as the first did, and large batches have enough."""
+    second = dataclasses.replace(PHASE, steps=400, height=42, batch=32)
+    recipe = dataclasses.replace(recipe_of(folder), stages=(dataclasses.replace(PHASE, steps=1000), second))
+    with opened_worlds(recipe, tmp_path) as worlds:
+        assert worlds is not None
+        first = [draw.numbers for step in range(1000, 1010) if (draw := worlds.draw(step)) is not None]
+        drawn = [number for step in range(1400) if (draw := worlds.draw(step)) is not None for number in draw.numbers]
+    assert max(max(row) for row in first) < 2 * 32 + 10 * 32
+    assert 3 < len(drawn) / (len({*drawn}) + 16) < 8  # `reuse` is 4; two sizes have equal numbers
+
+
+def test_a_run_is_told_of_a_renderer_that_ended(folder, tmp_path):
+    with ClipPool(tmp_path, [Job(str(folder), ROOMS, 3, 28, 28, 14, 0)]) as pool:
+        pool.clips(0, [0], [np.arange(3)])
+        for process in pool._workers._processes.values():
+            process.kill()
+            process.join()
+        with pytest.raises(VggtjaxError, match="a process that renders clips ended"):
+            pool.clips(0, [1], [np.arange(3)])
 
 
 def test_frames_are_taken_in_the_order_that_is_asked_for(clips, folder, tmp_path):

@@ -9,13 +9,13 @@ import trimesh
 from tests.shared.asset_folder import write_assets
 from vggtjax.errors import InputError
 from vggtjax.training.world.assets import PANORAMA, make_tiles, read_assets, sample_panorama, sample_tiles
-from vggtjax.training.world.casting import Light, Moment, Stage, World
+from vggtjax.training.world.casting import Light, Moment, Stage, World, prepare
 from vggtjax.training.world.clip import world_clip
 from vggtjax.training.world.config import Cameras, Movers, Places, WorldConfig
 from vggtjax.training.world.meshes import Surface, box, join, pillar
 from vggtjax.training.world.motion import STEPS, Actor
 
-SIZE = {"frames": 4, "height": 32, "width": 48, "patch": 8}
+SIZE = {"frames": 4, "height": 32, "width": 48, "patch": 4}
 SHARP = WorldConfig(blur=0, rolling=0, compression=0, noise=0, flicker=0)
 
 
@@ -34,7 +34,7 @@ def clip(request, assets):
     """A clip of each kind of place, in which something moves."""
     places = dataclasses.replace(Places(0, 0, 0), **{request.param: 1.0})
     config = dataclasses.replace(SHARP, places=places, dynamic=1.0, cameras=Cameras(1, 1, 0, 0, 0))
-    return world_clip(assets, config, (3, 1), **SIZE)
+    return world_clip(assets, config, (3, 5), **SIZE)
 
 
 def camera_points(clip, frame, points):
@@ -46,15 +46,15 @@ def camera_points(clip, frame, points):
 def test_tracks_start_at_their_patch_and_agree_with_depth_where_they_are_seen(clip):
     S, H, W = clip.depth.shape
     fx, cx, cy = clip.intrinsics[0, 0], clip.intrinsics[0, 2], clip.intrinsics[1, 2]
-    y, x = (np.mgrid[4:H:8, 4:W:8] + 0.5).reshape(2, -1)
+    y, x = (np.mgrid[2:H:4, 2:W:4] + 0.5).reshape(2, -1)
     hits = total = 0
     for r, s in np.ndindex(S, S):
-        known = (clip.depth[r, 4::8, 4::8] > 0).ravel()
+        known = (clip.depth[r, 2::4, 2::4] > 0).ravel()
         seen = camera_points(clip, s, clip.tracks[r, known, s])
         u, v = fx * seen[:, 0] / seen[:, 2] + cx, fx * seen[:, 1] / seen[:, 2] + cy
         if r == s:
             np.testing.assert_allclose(np.stack([u, v]), np.stack([x, y])[:, known], atol=2e-2)
-            np.testing.assert_allclose(seen[:, 2], clip.depth[r, 4::8, 4::8].ravel()[known], rtol=1e-3)
+            np.testing.assert_allclose(seen[:, 2], clip.depth[r, 2::4, 2::4].ravel()[known], rtol=1e-3)
             continue
         inside = (seen[:, 2] > 0.1) & (u > 0) & (u < W) & (v > 0) & (v < H)
         shown = clip.depth[s, v[inside].astype(int), u[inside].astype(int)]
@@ -69,10 +69,10 @@ def test_what_moves_moves_and_what_stands_still_does_not(clip):
     still = (clip.object_ids == 0) & (clip.depth > 0)
     assert np.abs(clip.scene_flow[still]).max() < 1e-5
     assert np.abs(clip.scene_flow[clip.dynamic_mask]).max() > 1e-3
-    r, p = np.argwhere(clip.dynamic_mask[:-1, 4::8, 4::8].reshape(len(clip.depth) - 1, -1))[0]
-    row, column = np.divmod(p, SIZE["width"] // 8)
+    r, p = np.argwhere(clip.dynamic_mask[:-1, 2::4, 2::4].reshape(len(clip.depth) - 1, -1))[0]
+    row, column = np.divmod(p, SIZE["width"] // 4)
     moved = clip.tracks[r, p, r + 1] - clip.tracks[r, p, r]
-    np.testing.assert_allclose(moved, clip.scene_flow[r, 8 * row + 4, 8 * column + 4], atol=1e-4)
+    np.testing.assert_allclose(moved, clip.scene_flow[r, 4 * row + 2, 4 * column + 2], atol=1e-4)
 
 
 def test_a_seed_is_a_clip_and_splits_share_no_file(assets, folder):
@@ -93,9 +93,9 @@ def test_hits_are_those_of_a_slow_search():
     actor = Actor(mover, mover.vertices[None], 0.0, 0.0, 2.0, place, np.zeros((STEPS, 3)))
     light = Light(np.array([0, 0, 1.0]), False, 1.0, np.ones(3))
     tiles = make_tiles([np.full((128, 128, 3), 128, np.uint8)])
-    moment = Moment(Stage(World(still, (actor,), light, np.zeros((2, 4, 3), np.uint8), 0.0), tiles), 1.5)
-    origin = np.float32(generator.normal((0, 0, 4), 1, (300, 3)))
-    direction = np.float32(generator.normal((0, 0, -1), 0.3, (300, 3)))
+    moment = Moment(Stage(World(prepare(still), (actor,), light, np.zeros((2, 4, 3), np.uint8), 0.0), tiles), 1.5)
+    origin = np.asarray(generator.normal((0, 0, 4), 1, (300, 3)), np.float32)
+    direction = np.asarray(generator.normal((0, 0, -1), 0.3, (300, 3)), np.float32)
     hits = moment.cast(origin, direction)
     triangles = np.concatenate([m[f] for m, f in ((still.vertices, still.faces), (moment.positions[0], mover.faces))])
     np.testing.assert_allclose(moment.positions[0].mean(axis=0), [0, 0.5, 0.75], atol=1e-6)
@@ -168,3 +168,48 @@ def test_boxes_are_closed():
     """The light falls on the outside of every face: normals of the made meshes point outwards."""
     for mesh in (box((1, 2, 3), Surface(0)), pillar(1, 2, Surface(0))):
         assert trimesh.Trimesh(mesh.vertices, mesh.faces).volume > 0
+
+
+def test_a_rolling_shutter_and_blur_are_centred_on_the_truth(assets):
+    """The mean shift between pictures with and without them is less than half a pixel, on a camera that turns fast."""
+    turning = dataclasses.replace(SHARP, dynamic=0, cameras=Cameras(0, 0, 1, 0, 0), seconds=(0.6, 0.6), shake=0)
+    shape = {"frames": 3, "height": 32, "width": 48}
+    for flaw in ("blur", "rolling"):
+        shifts = []
+        for seed in range(6):
+            sharp, flawed = (
+                world_clip(assets, dataclasses.replace(turning, **{flaw: x}), (seed,), **shape) for x in (0, 1)
+            )
+            np.testing.assert_array_equal(sharp.camera_from_world, flawed.camera_from_world)
+            a, b = (clip.images[1].astype(float).mean(axis=-1) for clip in (sharp, flawed))
+            shifts.append(shift_along_x(a, b))
+        assert abs(np.mean(shifts)) < 0.5, flaw
+
+
+def shift_along_x(a, b):
+    """Pixels by which `b` lies to the right of `a`, by least squares of the brightness against its slope."""
+    slope = np.gradient(a, axis=1)
+    return -((b - a) * slope).sum() / (slope**2).sum()
+
+
+def test_portrait_clips_have_the_field_of_view_along_the_longer_side(assets):
+    config = dataclasses.replace(SHARP, field_of_view=(60, 60))
+    for height, width in ((48, 32), (32, 48)):
+        clip = world_clip(assets, config, (1,), frames=2, height=height, width=width)
+        assert clip.intrinsics[0, 0] == pytest.approx(24 / np.tan(np.deg2rad(30)))
+        assert clip.tracks.shape == (2, 0, 2, 3)
+
+
+def test_what_stands_before_the_light_is_dark():
+    """A plate under a lid sees the sun from the side alone."""
+    look = Surface(0)
+    plate, lid = box((4, 4, 0.1), look), box((1, 1, 0.1), look).moved(np.eye(3), np.array([0, 0, 1.0]))
+    sun = Light(np.array([0, 0, 1.0]), False, 0.2, np.ones(3))
+    tiles = make_tiles([np.full((128, 128, 3), 255, np.uint8)])
+    stage = Stage(World(prepare(join([plate, lid])), (), sun, np.zeros((2, 4, 3), np.uint8), 0.0), tiles)
+    origin = np.asarray([[0.2, 0.1, 0.5], [1.5, 0.1, 0.5], [0.2, 0.1, 3]], np.float32)
+    direction = np.asarray([[0, 0, -1]] * 3, np.float32)
+    moment = Moment(stage, 0.0)
+    shade, lit, top = moment.colours(moment.cast(origin, direction), origin, direction, 0.01)[:, 0]
+    assert shade == pytest.approx(0.2)
+    assert lit == top == 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,6 +19,7 @@ from vggtjax.storage.writing import check_file
 if TYPE_CHECKING:
     import numpy as np
 
+    from vggtjax.clips.truth import Truth
     from vggtjax.research.calibration.choice import Choice
     from vggtjax.research.calibration.second_pass import SecondPassChoice
     from vggtjax.training.scenes import SyntheticClip
@@ -37,6 +39,7 @@ def calibrate_cues(
     max_terms: int = 5,
     floor: float = 0.0,
     mask_pairs: _Pairs = None,
+    assets: Path | None = None,
     seed: int = 0,
 ) -> None:
     """Choose a model's motion cues and the pairs of blocks that match frames, and save the model with them.
@@ -56,6 +59,8 @@ def calibrate_cues(
         mask_pairs: numbers of pairs to try on all of the scenes, with masks mined by both thresholds (otsu,
             multi-otsu). The number and the threshold with the lowest camera errors become what the model recommends;
             without this option the model keeps its own.
+        assets: folder of textures, photographs and objects: clips are of rooms, streets and landscapes of these, 16:9,
+            instead of rooms of simple shapes.
         seed: another seed draws other scenes.
     """
     if scenes < 2:
@@ -85,7 +90,8 @@ def calibrate_cues(
             raise InputError(f"size is {side}; expected a multiple of the patch size {loaded.config.patch_size}")
         numbers = None if mask_pairs is None else pairs_to_try(mask_pairs, loaded.config.depth)
         with report.stage("sweep") as progress:
-            drawn = generated_clips(scenes, frames, side, seed)
+            draw = partial(_clips, assets, scenes, frames, side, loaded.config.patch_size, seed)
+            drawn = draw()
             clips = ((np.asarray(clip.images), np.asarray(clip.dynamic_mask)) for clip in drawn)
             swept = sweep(loaded.params, clips, loaded.config, progress=progress, total=scenes)
         with report.stage("choose") as progress:
@@ -93,10 +99,14 @@ def calibrate_cues(
         second = None
         if numbers:
             with report.stage("try second passes") as progress:
-                clips = generated_clips(scenes, frames, side, seed)
                 with_cues = calibrated(loaded, choice)
-                second = choose_second_pass(with_cues, clips, numbers, gram=gram, progress=progress, total=scenes)
-        source = {"scenes": scenes, "frames": frames, "size": side, "textures": "training"}
+                second = choose_second_pass(with_cues, draw(), numbers, gram=gram, progress=progress, total=scenes)
+        source = {
+            "scenes": scenes,
+            "frames": frames,
+            "size": side,
+            "textures": "training" if assets is None else "assets",
+        }
         source |= {"key": f"fold_in(fold_in(key({seed}), {_KEYS}), scene)"}
         with report.stage("write"):
             path = save_calibration(out, loaded, swept, choice, second=second, source=source)
@@ -136,6 +146,30 @@ def _matching_line(pairs: tuple[int, ...] | None, shares: np.ndarray) -> str:
     found = ", ".join(f"{pair} ({shares[pair]:.0%} of the matches come back)" for pair in pairs)
     others = [share for pair, share in enumerate(shares) if pair not in pairs]
     return f"Pairs of blocks that match frames: {found}" + (f"; others at most {max(others):.0%}." if others else ".")
+
+
+def _clips(
+    assets: Path | None, scenes: int, frames: int, size: int, patch: int, seed: int
+) -> Iterator[SyntheticClip | Truth]:
+    """Yield generated rooms, or worlds of a folder of assets, one at a time."""
+    if assets is None:
+        yield from generated_clips(scenes, frames, size, seed)
+        return
+    import numpy as np
+
+    from vggtjax.clips.truth import Truth
+    from vggtjax.training.world.assets import read_assets
+    from vggtjax.training.world.casting import check_embree
+    from vggtjax.training.world.clip import world_clip
+    from vggtjax.training.world.config import WorldConfig
+
+    check_embree()
+    found, config = read_assets(assets), WorldConfig(dynamic=1.0)
+    shape = {"frames": frames, "height": max(round(size * 9 / 16 / patch), 1) * patch, "width": size}
+    for scene in range(scenes):
+        clip = world_clip(found, config, (seed, _KEYS, scene), **shape)
+        truth = clip.depth, clip.dynamic_mask, clip.camera_from_world
+        yield Truth((clip.images / 255).astype("float32"), *truth, np.broadcast_to(clip.intrinsics, (frames, 3, 3)))
 
 
 def generated_clips(scenes: int, frames: int, size: int, seed: int) -> Iterator[SyntheticClip]:

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from vggtjax.errors import InputError
 from vggtjax.interface.commands.report import Report
 
 
@@ -49,8 +50,8 @@ def scenes(
         count: number of scenes.
         images: how the images are drawn.
         assets: folder of textures/, photos/ and objects/, for rooms, streets and landscapes of these instead of rooms
-            of simple shapes; of the images, frames, height and width are then read.
-        kind: "static", or "dynamic" where one to three objects move, not always in view.
+            of simple shapes.
+        kind: "static", or "dynamic" where one to three objects move (of assets one to four), not always in view.
         split: of the textures, and of the assets; the two splits share no pixels of a photograph.
         seed: another seed draws other scenes.
     """
@@ -63,6 +64,8 @@ def scenes(
             config = SceneConfig(**asdict(images))
         with report.stage("generate") as progress:
             chosen = {"count": count, "kind": kind, "split": split, "seed": seed}
+            if assets is not None and images != Images(images.frames, images.height, images.width):
+                raise InputError("--samples, --shutter and --exposures are of rooms of simple shapes; leave them out")
             if assets is None:
                 folders = write_scenes(out, config, **chosen, progress=progress)
             else:

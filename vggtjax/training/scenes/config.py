@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 from msgspec import Meta
 
 from vggtjax.errors import InputError
 from vggtjax.storage.json_values import Share, check_fields
 
+Split = Literal["training", "test"]  # of textures
 Side = Annotated[int, Meta(ge=8, le=2048)]  # pixels
 Objects = Annotated[int, Meta(ge=1, le=64)]
 Travel = Annotated[float, Meta(ge=0, le=2)]

@@ -43,6 +43,7 @@ MARKS = {"format": "vggtjax scenes", "version": _FORMAT_VERSION}  # of an index
 _LATER = {"pitch": [0.0, 0.0], "roll": 0.0}  # as in sets before these fields
 _STREAM = 0x73657473  # folded into the seed's key, so that no other use of a seed draws these scenes
 _MILLIMETRES = 1000.0
+_MOST_DEPTH = 65.5  # metres that 16 bits hold in millimetres
 _PNG_LEVEL = 3  # zlib's; higher ones take several times as long for a few percent
 _WORKERS = 8
 _INDEX_BYTES = 2**22
@@ -57,7 +58,7 @@ CONVENTIONS = {
 FILES = {
     "images/*.png": "RGB, 8 bits",
     "depth/*.npy": "float32 [H, W], metres along z",
-    "depth/*.png": "uint16, the same in millimetres",
+    "depth/*.png": "uint16, the same in millimetres, 0 from 65.5 metres on",
     "mask/*.png": "uint8, 255 on parts that move in the clip, else 0; shadows do not count",
     "parts/*.png": "uint8, number of the part",
     "flow/*.npy": "float32 [H, W, 3], world axes: where the pixel's point is a frame later, minus where it is",
@@ -189,6 +190,7 @@ def _check_folder(out: Path, index: dict[str, Any]) -> None:
             raise OutputError(f"{leftovers[0]} exists without {INDEX} beside it; choose another folder or move it away")
         return
     existing = read_index(out)
+    # Sets of worlds have other fields.
     if isinstance(existing.get("config"), dict) and _LATER.keys() <= index["config"].keys():
         existing["config"] = _LATER | existing["config"]
     other = [name for name in ("kind", "split", "seed", "config") if existing.get(name) != index[name]]
@@ -253,7 +255,7 @@ def _write_frame(folder: Path, clip: SceneFiles, frame: int) -> None:
     depth = np.asarray(clip.depth[frame])
     pictures = {
         "images": clip.images[frame],
-        "depth": encode_depth(depth, depth > 0, _MILLIMETRES),
+        "depth": encode_depth(depth, (depth > 0) & (depth < _MOST_DEPTH), _MILLIMETRES),
         "mask": np.uint8(255) * clip.dynamic_mask[frame],
         "parts": clip.parts[frame],
     }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal, NamedTuple, get_args
+from typing import NamedTuple, get_args
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,8 +11,8 @@ from jaxtyping import Array, Float, Int, UInt8
 from PIL import Image
 
 from vggtjax.errors import check_choice
+from vggtjax.training.scenes.config import Split
 
-Split = Literal["training", "test"]
 SIDES = (256, 128, 64, 32, 16)  # pyramid of a tile, finest first
 PHOTOGRAPHS = (
     "astronaut.png", "brick.png", "camera.png", "cell.png", "chelsea.png", "coffee.png", "coins.png", "grass.png",

@@ -9,6 +9,7 @@ objects/*.npz               meshes in metres, z up, standing on z = 0: vertices 
 from __future__ import annotations
 
 import functools
+import hashlib
 import re
 from collections.abc import Callable, Iterable
 from math import prod
@@ -22,13 +23,16 @@ from PIL import Image
 from vggtjax.clips.media.images import read_image
 from vggtjax.errors import InputError, ResultError
 from vggtjax.storage.arrays import read_arrays, read_headers
-from vggtjax.training.scenes.textures import Split
+from vggtjax.training.scenes.config import Split
 
+KINDS = ("textures", "photos", "objects")
 SIDES = (128, 64, 32, 16, 8)  # pyramid of a tile, finest first
 PANORAMA = (192, 384)  # height and width
 _SUFFIXES = {".jpg", ".jpeg", ".png", ".webp"}
 _TEST = 5  # every fifth file of a material, the photographs, the panoramas and the objects is for test scenes
+_GAIT = "anim_"  # begins the names of objects with a gait
 _MOST_FILES = 20_000
+_FARTHEST, _MOST_REPEATS, _FASTEST = 1000, 10_000, 240  # metres; of a texture; poses a second
 _MOST_VALUES = 3_000_000  # of all arrays of one object
 # The materials of surfaces, by the first word of a texture's name; a folder without any of a row lends all of its own.
 MATERIALS = {
@@ -62,7 +66,11 @@ class Tiles(NamedTuple):
     """Square RGB pictures with their pyramids, in one row of texels: level by level, in each level tile by tile."""
 
     texels: UInt8[np.ndarray, "N 3"]
-    count: int
+
+    @property
+    def number(self) -> int:
+        """Number of tiles, from the shape."""
+        return self.texels.shape[0] // sum(side * side for side in SIDES)
 
 
 class Shape(NamedTuple):
@@ -85,7 +93,7 @@ class Assets(NamedTuple):
 
     tiles: Tiles
     materials: dict[str, np.ndarray]  # row of MATERIALS, and "any" -> numbers of tiles
-    panoramas: UInt8[np.ndarray, "N 192 384 3"]
+    panoramas: list[UInt8[np.ndarray, "192 384 3"]]
     shapes: dict[str, Shape]
 
 
@@ -101,17 +109,8 @@ def read_assets(folder: str | Path, split: Split = "training") -> Assets:
 
 @functools.lru_cache(maxsize=2)
 def _read(folder: Path, split: Split) -> Assets:
-    pictures = _of_split(_files(folder / "textures", _SUFFIXES), split, _material, _stem)
-    photos = _of_split(_files(folder / "photos", _SUFFIXES), split, lambda _: "", _place)
-    panoramas = [path for path in photos if path.name.startswith("pano_")]
-    photos = [path for path in photos if not path.name.startswith("pano_")]
-    meshes = _of_split(_files(folder / "objects", {".npz"}), split, _gait, _stem)
-    meshes = {path.stem: _arrays(path) for path in meshes}
-    still = [name for name in meshes if not name.startswith("anim_")]
-    kinds = ("textures", pictures), ("photos", photos), ("pano_* photos", panoramas), ("objects at rest", still)
-    for name, found in kinds:
-        if not found:
-            raise InputError(f"{folder} has no {name} for {split}; expected at least {_TEST} files of each kind")
+    pictures, photos, panoramas, objects = chosen_files(folder, split)
+    meshes = {path.stem: _arrays(path) for path in objects}
     images = [_square(read_image(path)) for path in (*pictures, *photos)]
     images += [_square(Image.fromarray(mesh["texture"])) for mesh in meshes.values()]
     materials = [*(_material(path) for path in pictures), *("photo" for _ in photos)]
@@ -120,8 +119,36 @@ def _read(folder: Path, split: Split) -> Assets:
     every = np.arange(first)
     rows = {row: np.flatnonzero(np.isin(materials, words)) for row, words in MATERIALS.items()}
     rows = {row: numbers if len(numbers) else every for row, numbers in rows.items()}
-    turned = [read_image(path).resize(PANORAMA[::-1], Image.Resampling.BICUBIC) for path in panoramas]
-    return Assets(make_tiles(images), rows | {"any": every}, np.stack([np.asarray(image) for image in turned]), shapes)
+    turned = [read_image(path).resize((PANORAMA[1], PANORAMA[0]), Image.Resampling.BICUBIC) for path in panoramas]
+    return Assets(make_tiles(images), rows | {"any": every}, [np.asarray(image) for image in turned], shapes)
+
+
+def chosen_files(folder: Path, split: Split) -> tuple[list[Path], list[Path], list[Path], list[Path]]:
+    """Return a split's textures, photographs, panoramas and objects, without reading them.
+
+    Raises InputError where a kind is missing.
+    """
+    pictures = _of_split(_files(folder / "textures", _SUFFIXES), split, _material, _stem)
+    photos = _of_split(_files(folder / "photos", _SUFFIXES), split, lambda _: "", _place)
+    panoramas = [path for path in photos if path.name.startswith("pano_")]
+    photos = [path for path in photos if not path.name.startswith("pano_")]
+    objects = _of_split(_files(folder / "objects", {".npz"}), split, _gait, _model)
+    still = [path for path in objects if not path.name.startswith(_GAIT)]
+    kinds = ("textures", pictures), ("photos", photos), ("pano_* photos", panoramas), ("objects at rest", still)
+    for name, found in kinds:
+        if not found:
+            raise InputError(
+                f"{folder} has no {name} for {split}; expected at least {_TEST} of each kind, and of textures of one "
+                "material"
+            )
+    return pictures, photos, panoramas, objects
+
+
+def fingerprint(folder: str | Path) -> str:
+    """Return a digest of the names and sizes of a folder's assets: another one for other files."""
+    names = (path for kind in KINDS for path in _files(Path(folder) / kind, {*_SUFFIXES, ".npz"}))
+    rows = [f"{path.parent.name}/{path.name} {path.stat().st_size}" for path in names]
+    return hashlib.sha256("\n".join(sorted(rows)).encode()).hexdigest()[:16]
 
 
 def sample_tiles(
@@ -133,7 +160,7 @@ def sample_tiles(
     """
     level = np.clip(np.rint(np.log2(np.maximum(footprint * SIDES[0], 1e-6))), 0, len(SIDES) - 1).astype(np.int32)
     side = SIDES[0] >> level
-    starts = np.concatenate([[0], np.cumsum([s * s for s in SIDES])[:-1]]).astype(np.int64) * tiles.count
+    starts = np.concatenate([[0], np.cumsum([s * s for s in SIDES])[:-1]]).astype(np.int64) * tiles.number
     start = starts[level] + tile.astype(np.int64) * side * side
     position = np.mod(uv, 1.0) * side[:, None] - 0.5
     low = np.floor(position).astype(np.int32)
@@ -189,15 +216,22 @@ def _of_split(
 
 def _place(path: Path) -> str:
     """Return the place that a photograph shows: views and panorama of one place are of one split."""
-    return re.sub(r"^(hdri|pano)_|_\d+$", "", path.stem)
+    return (
+        path.stem.removeprefix("pano_") if path.stem.startswith("pano_") else re.sub(r"^hdri_|_\d{3}$", "", path.stem)
+    )
 
 
 def _stem(path: Path) -> str:
     return path.stem
 
 
+def _model(path: Path) -> str:
+    """Return an object without its gait: all gaits of one model are of one split."""
+    return path.stem.removesuffix("_" + path.stem.split("_")[-1]) if path.stem.startswith(_GAIT) else path.stem
+
+
 def _gait(path: Path) -> str:
-    return "moves" if path.stem.startswith("anim_") else "still"
+    return "moves" if path.stem.startswith(_GAIT) else "still"
 
 
 def _material(path: Path) -> str:
@@ -215,7 +249,7 @@ def make_tiles(images: list[np.ndarray]) -> Tiles:
         for side in SIDES
         for image in images
     ]
-    return Tiles(np.concatenate(levels), len(images))
+    return Tiles(np.concatenate(levels))
 
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:
@@ -228,23 +262,32 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
         mesh = read_arrays(path, names)
     except ResultError as error:
         raise InputError(f"{path}: {error}") from error
-    vertices, faces, uv, texture = (mesh.get(name, np.zeros(0)) for name in ("vertices", "faces", "uv", "texture"))
-    count = vertices.shape[-2] if vertices.ndim in (2, 3) else 0
+    vertices, faces, uv, texture = (mesh.get(name, np.zeros(0)) for name in names[:4])
+    moves, rate = path.stem.startswith(_GAIT), mesh.get("fps", np.zeros(0))
+    count = vertices.shape[-2] if vertices.ndim == 2 + moves and vertices.size else 0
     fits = vertices.shape[-1:] == (3,) and uv.shape == (count, 2) and faces.ndim == 2 and faces.shape[1:] == (3,)
-    fits = fits and texture.ndim == 3 and texture.shape[-1] == 3 and texture.dtype == np.uint8
-    if not (fits and faces.size and np.issubdtype(faces.dtype, np.integer) and 0 <= faces.min() <= faces.max() < count):
+    fits = fits and vertices.dtype.kind == uv.dtype.kind == "f" and faces.dtype.kind in "iu"
+    fits = fits and texture.ndim == 3 and texture.shape[-1] == 3 and texture.dtype == np.uint8 and texture.size > 0
+    if not (fits and faces.size and 0 <= faces.min() <= faces.max() < count):
         raise InputError(
-            f"{path} is not an object; expected vertices [V, 3] or [T, V, 3], faces [F, 3] of their numbers, "
-            "uv [V, 2] and texture [H, W, 3] of bytes"
+            f"{path} is not an object; expected vertices [V, 3] ({_GAIT}*: [T, V, 3]) and uv [V, 2] of floats, faces "
+            "[F, 3] of their numbers, and texture [H, W, 3] of bytes"
         )
-    if not (np.isfinite(vertices).all() and np.isfinite(uv).all()):
-        raise InputError(f"{path} has vertices or texture coordinates that are not finite")
+    if not (np.abs(vertices) < _FARTHEST).all() or not (np.abs(uv) < _MOST_REPEATS).all():
+        raise InputError(
+            f"{path} has vertices or uv that are not numbers or too large; expected less than {_FARTHEST} metres and "
+            f"{_MOST_REPEATS} repetitions"
+        )
+    if moves and not (rate.shape == () and rate.dtype.kind in "iuf" and 0 < rate <= _FASTEST):
+        raise InputError(f"{path} has no fps; expected poses a second of its gait, up to {_FASTEST}")
     return mesh
 
 
 def _shape(mesh: dict[str, np.ndarray], tile: int) -> Shape:
     vertices = mesh["vertices"].astype(np.float32)
-    uv = mesh["uv"].astype(np.float32) * np.float32([1, -1]) + np.float32([0, 1])  # rows of pictures go down
-    rate = float(mesh["fps"]) if "fps" in mesh and vertices.ndim == 3 else 0.0
+    uv = mesh["uv"].astype(np.float32) * np.asarray([1, -1], np.float32) + np.asarray(
+        [0, 1], np.float32
+    )  # rows of pictures go down
+    rate = float(mesh["fps"]) if vertices.ndim == 3 else 0.0
     faces = mesh["faces"].astype(np.int32)
     return Shape(vertices.reshape(-1, *vertices.shape[-2:]), faces, uv[faces], tile, rate)

@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from vggtjax.errors import MissingExtraError
+from vggtjax.errors import check_extra
 from vggtjax.training.world.assets import Tiles, sample_panorama, sample_tiles
 from vggtjax.training.world.meshes import Mesh, join
 from vggtjax.training.world.motion import Actor
 
 FARTHEST = 120.0  # metres along z; what is farther is sky
-_SKY = 1e4
 _OFF = 2e-3  # metres from a surface to the start of its ray to the light
+
+
+_NOTHING = Mesh(
+    np.zeros((0, 3), np.float32),
+    np.zeros((0, 3), np.int32),
+    np.zeros((0, 3, 2), np.float32),
+    np.zeros(0, np.int32),
+    np.zeros((0, 3), np.float32),
+)
 
 
 class Light(NamedTuple):
@@ -26,10 +34,18 @@ class Light(NamedTuple):
     colour: Float[np.ndarray, " 3"]
 
 
+class Still(NamedTuple):
+    """What stands still, made ready for casting."""
+
+    mesh: Mesh
+    scene: Any  # Embree's
+    density: Float[np.ndarray, " F"]  # tiles a metre of every triangle
+
+
 class World(NamedTuple):
     """What stands still, what moves, and the light."""
 
-    still: Mesh
+    still: Still
     actors: tuple[Actor, ...]
     light: Light
     panorama: UInt8[np.ndarray, "H W 3"]  # the sky
@@ -41,8 +57,13 @@ class Hits(NamedTuple):
 
     distance: Float[np.ndarray, " P"]  # in units of the ray's direction
     actor: Int[np.ndarray, " P"]  # 0 for what stands still, from 1 for actors
-    face: Int[np.ndarray, " P"]
+    face: Int[np.ndarray, " P"]  # of the mesh that stands still, or of all actors' meshes together
     corners: Float[np.ndarray, "P 3"]  # barycentric
+
+
+def prepare(mesh: Mesh) -> Still:
+    """Return a mesh that stands still, made ready for casting."""
+    return Still(mesh, _embree(mesh.vertices, mesh.faces), _density(mesh))
 
 
 class Moment:
@@ -51,16 +72,13 @@ class Moment:
     def __init__(self, stage: Stage, time: float) -> None:
         self._stage = stage
         self.positions = [actor.vertices(time) for actor in stage.world.actors]
-        self._actors = None
-        if self.positions:
-            parts = zip(stage.world.actors, self.positions, strict=True)
-            self._vertices = join([actor.mesh._replace(vertices=at) for actor, at in parts]).vertices
-            self._actors = _embree(self._vertices, stage.moving.faces)
+        self._vertices = np.concatenate(self.positions) if self.positions else np.zeros((0, 3), np.float32)
+        self._actors = None if not self.positions else _embree(self._vertices, stage.moving.faces)
 
     def cast(self, origin: Float[np.ndarray, "P 3"], direction: Float[np.ndarray, "P 3"]) -> Hits:
         """Return the first hits of rays."""
         stage = self._stage
-        found = _first(stage.embree, origin, direction)
+        found = _first(stage.world.still.scene, origin, direction)
         if self._actors is None:
             return Hits(found[0], np.where(np.isfinite(found[0]), 0, -1), *found[1:])
         other = _first(self._actors, origin, direction)
@@ -71,7 +89,9 @@ class Moment:
         actor = np.where(nearer, stage.actor_of_face[np.where(nearer, face, 0)], 0)
         return Hits(distance, np.where(np.isfinite(distance), actor, -1), face, corners)
 
-    def colours(self, hits: Hits, origin, direction, pixel: float) -> Float[np.ndarray, "P 3"]:
+    def colours(
+        self, hits: Hits, origin: Float[np.ndarray, "P 3"], direction: Float[np.ndarray, "P 3"], pixel: float
+    ) -> Float[np.ndarray, "P 3"]:
         """Return what rays see, in [0, 1]; `pixel` is the size of a pixel at distance 1."""
         stage, world = self._stage, self._stage.world
         colour = np.empty((len(hits.face), 3), np.float32)
@@ -84,7 +104,7 @@ class Moment:
             rays = np.flatnonzero((hits.actor > 0) if moves else (hits.actor == 0))
             if not rays.size:
                 continue
-            mesh, density = (stage.moving, stage.moving_density) if moves else (world.still, stage.density)
+            mesh, density = (stage.moving, stage.moving_density) if moves else (world.still.mesh, world.still.density)
             vertices = self._vertices if moves else mesh.vertices
             face, corners = hits.face[rays], hits.corners[rays]
             triangle = vertices[mesh.faces[face]]
@@ -100,7 +120,9 @@ class Moment:
             colour[rays] = albedo * self._brightness(point, normal)
         return np.clip(colour, 0, 1)
 
-    def _brightness(self, point, normal) -> Float[np.ndarray, "P 3"]:
+    def _brightness(
+        self, point: Float[np.ndarray, "P 3"], normal: Float[np.ndarray, "P 3"]
+    ) -> Float[np.ndarray, "P 3"]:
         light = self._stage.world.light
         to_light = light.place - point if light.is_lamp else np.broadcast_to(light.place, point.shape)
         distance = np.linalg.norm(to_light, axis=1, keepdims=True)
@@ -108,7 +130,7 @@ class Moment:
         start, reach = point + _OFF * normal, to_light if light.is_lamp else 300.0 * to_light
         hidden = facing <= 0
         lit = np.flatnonzero(~hidden)
-        for scene in (self._stage.embree, self._actors):
+        for scene in (self._stage.world.still.scene, self._actors):
             if scene is not None and lit.size:
                 hidden[lit] |= _hides(scene, start[lit], reach[lit])
         direct = np.where(hidden, 0, facing)
@@ -120,22 +142,19 @@ class Moment:
 
 
 class Stage:
-    """A world made ready for casting."""
+    """A world and its tiles; the meshes of all actors as one, whose faces are those of `Hits`."""
 
     def __init__(self, world: World, tiles: Tiles) -> None:
         self.world, self.tiles = world, tiles
-        self.embree = _embree(world.still.vertices, world.still.faces)
-        self.density = _density(world.still)
-        if world.actors:
-            self.moving = join([actor.mesh for actor in world.actors])
-            self.moving_density = _density(self.moving)
-            counts = [len(actor.mesh.faces) for actor in world.actors]
-            self.actor_of_face = np.repeat(np.arange(1, len(counts) + 1), counts)
-            self.first_face = np.cumsum([0, *counts])
+        self.moving = join([actor.mesh for actor in world.actors]) if world.actors else _NOTHING
+        self.moving_density = _density(self.moving)
+        counts = [len(actor.mesh.faces) for actor in world.actors]
+        self.actor_of_face = np.repeat(np.arange(1, len(counts) + 1), counts)
+        self.first_face = np.cumsum([0, *counts])
 
     def followed(self, point, hits: Hits, moments: list[Moment]) -> Float[np.ndarray, "N P 3"]:
-        """Return where the points of `hits` are at other moments."""
-        places = np.broadcast_to(np.float32(point), (len(moments), *point.shape)).copy()
+        """Return where the points [P, 3] of `hits` are at other moments."""
+        places = np.broadcast_to(np.asarray(point, np.float32), (len(moments), *point.shape)).copy()
         for number, actor in enumerate(self.world.actors, start=1):
             rays = np.flatnonzero(hits.actor == number)
             if rays.size:
@@ -145,18 +164,17 @@ class Stage:
                     places[index, rays] = np.einsum("pk,pkc->pc", hits.corners[rays], triangle)
         return places
 
-    def still_at(self, hits: Hits) -> Bool[np.ndarray, " P"]:
-        """Return which rays hit what stands still."""
-        return hits.actor == 0
+
+def check_embree() -> None:
+    """Raise MissingExtraError unless Embree is installed; call it before long work."""
+    check_extra("drawing scenes from a folder of assets", "train", "embreex")
 
 
-def _embree(vertices, faces):
-    try:
-        from embreex import rtcore_scene
-        from embreex.mesh_construction import TriangleMesh
-    except ImportError as error:
-        raise MissingExtraError("drawing scenes from a folder of assets", "train") from error
-    scene = rtcore_scene.EmbreeScene()
+def _embree(vertices: np.ndarray, faces: np.ndarray) -> Any:
+    from embreex import rtcore_scene
+    from embreex.mesh_construction import TriangleMesh
+
+    scene: Any = rtcore_scene.EmbreeScene()  # pyright: ignore
     TriangleMesh(scene, np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(faces, np.int32))
     return scene
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from vggtjax.training.world.assets import Assets
-from vggtjax.training.world.casting import FARTHEST, Moment, Stage, World
+from vggtjax.training.world.casting import FARTHEST, Moment, Stage, World, prepare
 from vggtjax.training.world.config import WorldConfig
 from vggtjax.training.world.meshes import join
 from vggtjax.training.world.places import make_place
@@ -16,16 +16,22 @@ from vggtjax.training.world.sampling import Filmed, choose, draw_actors, draw_ca
 from vggtjax.training.world.sensor import expose
 
 _SAMPLES = 2  # rays of a pixel along each side
-_TRIES = 64
+_PLACES, _CAMERAS = 8, 8  # most places that are made for a clip, and cameras that are tried in each
+_LOOKS = 12  # frames that are looked at before a clip is filmed
 _NEAREST, _CLOSEST = 0.25, 0.12  # metres: least median depth of a frame and least depth of its nearest twentieth
 _MOST_MOVING, _MOST_SKY = 0.6, 0.6  # shares of the pixels
 _LEAST_MOVING, _SPREAD = 0.01, 1.7  # of the pixels in some frame; of the 90th to the 10th percentile of depth there
 _OPEN = 0.6  # largest share of a frame's time in which the shutter is open
 _READ = 0.03  # largest seconds between the first and the last row of a rolling shutter
+_MOST_ROLL = 2.0  # pixels by which the camera may turn meanwhile
+GENERATOR = 4  # raised with every change that gives a seed another clip
 
 
 class WorldClip(NamedTuple):
-    """A clip and its truth. OpenCV cameras, metres; the world's z is up. Depth is 0 in the sky."""
+    """A clip and its truth. OpenCV cameras, metres; the world's z is up. Depth is 0 in the sky.
+
+    Truth is that of a frame's time: the middle of its exposure, and the middle row of a rolling shutter.
+    """
 
     images: UInt8[np.ndarray, "S H W 3"]
     depth: Float[np.ndarray, "S H W"]
@@ -42,28 +48,29 @@ class WorldClip(NamedTuple):
 
 
 def world_clip(
-    assets: Assets, config: WorldConfig, seed: tuple[int, ...], *, frames: int, height: int, width: int, patch: int
+    assets: Assets, config: WorldConfig, seed: tuple[int, ...], *, frames: int, height: int, width: int, patch: int = 0
 ) -> WorldClip:
-    """Return the clip of a seed.
+    """Return the clip of a seed; its tracks are those of patches of `patch` pixels, and empty for 0.
 
     Worlds are drawn until one can be filmed: nothing stands before the lens, and movers and sky leave something to see.
     """
     generator = np.random.default_rng(seed)
     seconds = float(np.exp(generator.uniform(*np.log(config.seconds))))
     times = np.linspace(0, seconds, frames)
-    for attempt in range(_TRIES):
-        if attempt % 8 == 0:
-            place = make_place(generator, assets, choose(generator, config.places), config.clutter)
-            moving = generator.random() < config.dynamic
-        actors = draw_actors(generator, assets, place, config, seconds) if moving else []
-        world = World(join(place.still), tuple(actors), place.light, place.panorama, generator.uniform(0, 2 * np.pi))
-        filmed = draw_camera(generator, place, actors, config, seconds)
-        if attempt % 8 == 0 or moving:
-            stage = Stage(world, assets.tiles)
-        lens = _Lens(filmed, height, width)
-        if _is_good(stage, lens, np.linspace(0, seconds, 7), moving=moving) or attempt == _TRIES - 1:
-            break
-    return _film(generator, stage, lens, config, times, patch)
+    moving = generator.random() < config.dynamic
+    stage = lens = None
+    for _ in range(_PLACES):
+        place = make_place(generator, assets, choose(generator, config.places), config.clutter)
+        still, sky_turn = prepare(join(place.still)), generator.uniform(0, 2 * np.pi)
+        for _ in range(_CAMERAS):
+            actors = draw_actors(generator, assets, place, config, seconds) if moving else []
+            stage = Stage(World(still, tuple(actors), place.light, place.panorama, sky_turn), assets.tiles)
+            lens = _Lens(draw_camera(generator, place, actors, config, seconds), height, width)
+            if _is_good(stage, lens, times[:: -(-frames // _LOOKS)], moving=moving):
+                return _film(generator, stage, lens, config, times, patch)
+    assert stage is not None
+    assert lens is not None
+    return _film(generator, stage, lens, config, times, patch)  # the last one, however poor
 
 
 class _Lens:
@@ -97,13 +104,18 @@ class _Lens:
             origin = np.broadcast_to(centre, direction.shape)
         return origin.reshape(-1, 3).astype(np.float32), direction.reshape(-1, 3).astype(np.float32)
 
+    def roll(self, time: float, read: float) -> float:
+        """Return by how many pixels in the middle of the picture the camera turns in `read` seconds around a time."""
+        first, last = (self.path.pose(time + sign * read / 2)[0] for sign in (-1, 1))
+        return self.focal * float(np.linalg.norm(first[:, 2] - last[:, 2]))
+
     def camera_from_world(self, time: float) -> Float[np.ndarray, "3 4"]:
         rotation, centre = self.path.pose(time)
         return np.concatenate([rotation.T, -(rotation.T @ centre)[:, None]], axis=-1)
 
 
 def _is_good(stage: Stage, lens: _Lens, times, *, moving: bool) -> bool:
-    """Return whether a clip is worth filming, by a few rays at seven times."""
+    """Return whether a clip is worth filming, by a few rays at some of its frames."""
     seen, spread = 0.0, 1.0
     for time in times:
         hits = Moment(stage, time).cast(*lens.rays(time, every=4))
@@ -122,16 +134,19 @@ def _film(generator, stage: Stage, lens: _Lens, config: WorldConfig, times: np.n
     step = float(times[1] - times[0]) if S > 1 else 1.0 / 30
     opened = min(generator.uniform(0.2, _OPEN) * step, 0.05) if generator.random() < config.blur else 0.0
     read = generator.uniform(0, min(_READ, step)) if generator.random() < config.rolling else 0.0
+    read *= min(1, _MOST_ROLL / max(max(lens.roll(time, read) for time in times), 1e-9))
     moments = [Moment(stage, time) for time in times]
     after = [*moments[1:], Moment(stage, float(times[-1]) + step)]
     offsets = [((i + 0.5) / _SAMPLES, (j + 0.5) / _SAMPLES) for i in range(_SAMPLES) for j in range(_SAMPLES)]
+    delays = generator.permutation((np.arange(len(offsets)) + 0.5) / len(offsets) - 0.5)
     centres = np.zeros((H, W), bool)
-    centres[patch // 2 :: patch, patch // 2 :: patch] = True
+    if patch:
+        centres[patch // 2 :: patch, patch // 2 :: patch] = True
     light, depth, ids, flow, tracks = [], [], [], [], []
     for index, time in enumerate(times):
         colour = np.zeros((H * W, 3), np.float32)
         for sample, offset in enumerate(offsets):
-            delay = opened * (sample / len(offsets) - 0.5)
+            delay = opened * delays[sample]
             moment = Moment(stage, time + delay) if opened and stage.world.actors else moments[index]
             rays = lens.rays(time + delay, offset, read=read)
             colour += moment.colours(moment.cast(*rays), *rays, 1 / lens.focal / _SAMPLES)

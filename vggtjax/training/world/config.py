@@ -11,7 +11,7 @@ from vggtjax.errors import InputError
 from vggtjax.storage.json_values import NotNegative, Share, check_fields
 
 Degrees = Annotated[float, Meta(ge=10, le=150)]
-Seconds = Annotated[float, Meta(ge=0.1, le=60)]
+Seconds = Annotated[float, Meta(ge=0.1, le=6)]  # paths have 65 points: enough for a hand that shakes at 5 Hz
 
 
 @dataclass(frozen=True)
@@ -55,13 +55,13 @@ class WorldConfig:
         seconds: range of the length of a clip; frames are at equal steps.
         motion: factor of what the camera travels and turns, in [0, 4].
         shake: factor of what the hand adds, in [0, 4].
-        field_of_view: range of the horizontal field of view, in degrees, of pictures that are wider than high.
+        field_of_view: range of the field of view along the longer side, in degrees.
         blur: share of clips with motion blur.
-        rolling: share of clips with a rolling shutter.
+        rolling: share of clips with a rolling shutter; truth is that of the middle row.
         compression: share of clips with blocks of JPEG.
         noise: largest standard deviation of the sensor's noise.
         vignette: largest loss of brightness in the corners.
-        flicker: standard deviation of the logarithm of the exposure from frame to frame.
+        flicker: size of the waves of the logarithm of the exposure.
     """
 
     places: Places = Places()

@@ -5,21 +5,22 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 
+from vggtjax.errors import check_choice
 from vggtjax.progress import Progress
-from vggtjax.training.scenes.config import SceneConfig
+from vggtjax.training.scenes.config import SceneConfig, Split
 from vggtjax.training.scenes.dataset import CONVENTIONS, FILES, MARKS, SceneFiles, check_set, write_set
 from vggtjax.training.scenes.held_out import Kind
-from vggtjax.training.scenes.textures import Split
-from vggtjax.training.world.assets import read_assets
-from vggtjax.training.world.clip import world_clip
+from vggtjax.training.world.assets import fingerprint, read_assets
+from vggtjax.training.world.casting import check_embree
+from vggtjax.training.world.clip import GENERATOR, world_clip
 from vggtjax.training.world.config import WorldConfig
 
 _STREAM = 0x776F7264  # beside a seed, so that no clip of a training run is drawn
 _PARTS = "0 stands still, 255 is sky, where depth is 0; what moves has its number from 1"
-_PATCH = 8  # the tracks of patches are not written
 
 
 def write_worlds(
@@ -54,11 +55,14 @@ def write_worlds(
         InputError: a value out of range, no folder of assets, or a folder with a set of other settings.
         OutputError: the folder cannot be written, or holds scenes or a preview without an index.
     """
-    out, found = Path(out), read_assets(assets, split)
+    check_embree()
     check_set(count, seed)
+    check_choice("kind", kind, get_args(Kind))
+    check_choice("split", split, get_args(Split))
+    out, found = Path(out), read_assets(assets, split)
     config = dataclasses.replace(config or WorldConfig(), dynamic=float(kind == "dynamic"))
-    frames, height, width = size.frames, size.height, size.width
-    drawn = {"frames": frames, "height": height, "width": width, "world": dataclasses.asdict(config)}
+    shape = {"frames": size.frames, "height": size.height, "width": size.width}
+    drawn = {"generator": GENERATOR, "assets": fingerprint(assets), **shape, "world": dataclasses.asdict(config)}
     index = {
         **MARKS,
         "about": "Generated rooms, streets and landscapes in which things stand or move, with exact truth.",
@@ -71,9 +75,8 @@ def write_worlds(
     }
 
     def draw(number: int) -> SceneFiles:
-        shape = {"frames": frames, "height": height, "width": width, "patch": _PATCH}
         clip = world_clip(found, config, (seed, _STREAM, number), **shape)
-        intrinsics = np.broadcast_to(clip.intrinsics, (frames, 3, 3))
+        intrinsics = np.broadcast_to(clip.intrinsics, (size.frames, 3, 3))
         truth = clip.dynamic_mask, clip.object_ids, clip.scene_flow, clip.camera_from_world, intrinsics
         return SceneFiles(clip.images, clip.depth, *truth, None)
 

@@ -55,7 +55,7 @@ def covered(vertices: np.ndarray, faces: np.ndarray, surface: Surface) -> Mesh:
     row = np.arange(len(faces))[:, None]
     uv = np.stack([corners[row, np.arange(3), u[:, None]], -corners[row, np.arange(3), v[:, None]]], axis=-1)
     cos, sin = np.cos(surface.turn), np.sin(surface.turn)
-    uv = surface.repeat * uv @ np.float32([[cos, -sin], [sin, cos]])
+    uv = surface.repeat * uv @ np.asarray([[cos, -sin], [sin, cos]], np.float32)
     return _mesh(vertices, faces, uv, surface)
 
 
@@ -68,23 +68,24 @@ def picture(origin, along, up, surface: Surface) -> Mesh:
     """Return a parallelogram that shows its tile once: `origin` is the lower left corner, metres."""
     origin, along, up = (np.asarray(x, np.float32) for x in (origin, along, up))
     vertices = np.stack([origin, origin + along, origin + along + up, origin + up])
-    corners = np.float32([[0, 1], [1, 1], [1, 0], [0, 0]]) * 0.999 + 0.0005
-    faces = np.int32([[0, 1, 2], [0, 2, 3]])
+    corners = np.asarray([[0, 1], [1, 1], [1, 0], [0, 0]], np.float32) * 0.999 + 0.0005
+    faces = np.asarray([[0, 1, 2], [0, 2, 3]], np.int32)
     return _mesh(vertices, faces, corners[faces], surface)
 
 
 def cutout(generator: np.random.Generator, width: float, height: float, surface: Surface) -> Mesh:
     """Return an upright picture in the x-z plane with a random smooth outline, standing on z = 0."""
     angle = np.linspace(0, 2 * np.pi, 32, endpoint=False)
-    waves = ((k, generator.uniform(-0.5, 0.5) / k, generator.uniform(0, 2 * np.pi)) for k in (2, 3, 5))
-    radius = 1 + sum(size * np.cos(k * angle + phase) for k, size, phase in waves)
+    radius = np.ones(32)
+    for k in (2, 3, 5):
+        radius += generator.uniform(-0.5, 0.5) / k * np.cos(k * angle + generator.uniform(0, 2 * np.pi))
     outline = np.stack([np.cos(angle), np.sin(angle)], axis=-1) * radius[:, None]
     outline = (outline - outline.min(axis=0)) / np.ptp(outline, axis=0)
     points = np.concatenate([outline.mean(axis=0, keepdims=True), outline]).astype(np.float32)
     ring = np.arange(32)
     faces = np.stack([np.zeros(32, int), 1 + ring, 1 + (ring + 1) % 32], axis=-1).astype(np.int32)
     vertices = np.stack([(points[:, 0] - 0.5) * width, 0 * points[:, 0], points[:, 1] * height], axis=-1)
-    uv = (points * np.float32([1, -1]) + np.float32([0, 1])) * 0.99 + 0.005
+    uv = (points * np.asarray([1, -1], np.float32) + np.asarray([0, 1], np.float32)) * 0.99 + 0.005
     return _mesh(vertices, faces, uv[faces], surface)
 
 
@@ -125,6 +126,6 @@ def relief(xs: np.ndarray, ys: np.ndarray, heights: Float[np.ndarray, "Y X"], su
 
 def _mesh(vertices, faces, uv, surface: Surface) -> Mesh:
     count = len(faces)
-    gain = np.broadcast_to(np.float32(surface.gain), (count, 3))
+    gain = np.broadcast_to(np.asarray(surface.gain, np.float32), (count, 3))
     tile = np.full(count, surface.tile, np.int32)
     return Mesh(np.asarray(vertices, np.float32), np.asarray(faces, np.int32), np.asarray(uv, np.float32), tile, gain)

@@ -26,8 +26,8 @@ class Actor(NamedTuple):
     def vertices(self, time: float) -> Float[np.ndarray, "V 3"]:
         """Return the world's positions of the vertices at a time in seconds."""
         pose = (self.phase + self.rate * time) % len(self.poses)
-        low = int(pose)
-        share = np.float32(pose - low)
+        low = int(pose) % len(self.poses)
+        share = np.asarray(pose - low, np.float32)
         body = self.poses[low] * (1 - share) + self.poses[(low + 1) % len(self.poses)] * share
         rotation = turned(along(self.turn, time / self.seconds))
         return (body @ rotation.T + along(self.place, time / self.seconds)).astype(np.float32)

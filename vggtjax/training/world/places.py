@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -14,7 +14,6 @@ from vggtjax.training.world.meshes import (
     Surface,
     boulder,
     box,
-    cutout,
     of_shape,
     picture,
     pillar,
@@ -22,6 +21,7 @@ from vggtjax.training.world.meshes import (
 )
 from vggtjax.training.world.motion import turned
 
+T = TypeVar("T")
 Spot = tuple[float, float, float]  # x, y, heading
 
 _SMALL, _VEHICLE = 2.7, 13.0  # metres: largest extent of furniture, of vehicles
@@ -42,6 +42,10 @@ class Place(NamedTuple):
     light: Light
     panorama: np.ndarray
     indoors: bool
+
+    def ground(self, x: float, y: float) -> float:
+        """Return the height of the ground at a point."""
+        return float(self.height(np.array(x), np.array(y)))
 
 
 def make_place(generator: np.random.Generator, assets: Assets, kind: str, clutter: float) -> Place:
@@ -92,13 +96,9 @@ def _still(assets: Assets) -> list[Shape]:
     return [shape for shape in assets.shapes.values() if not shape.rate]
 
 
-def _pick(generator: np.random.Generator, shapes: list[Shape], fallback: list[Shape]) -> Shape:
-    some = shapes or fallback
-    return some[int(generator.integers(len(some)))]
-
-
-def _sky(generator: np.random.Generator, assets: Assets) -> np.ndarray:
-    return assets.panoramas[int(generator.integers(len(assets.panoramas)))]
+def pick(generator: np.random.Generator, items: Sequence[T]) -> T:
+    """Return one of the items, each as likely as another."""
+    return items[int(generator.integers(len(items)))]
 
 
 def _sun(generator: np.random.Generator) -> Light:
@@ -115,13 +115,13 @@ def _scatter(
     made = []
     for _ in range(count):
         x, y, heading = place.spot(generator)
-        z = float(place.height(np.array(x), np.array(y)))
+        z = place.ground(x, y)
         draw = generator.random()
         if draw < 0.62:
-            shape = _pick(generator, shapes, _still(assets))
+            shape = pick(generator, shapes or _still(assets))
             made.append(standing(shape, x, y, z, heading, tint(generator, 0.12)))
         elif draw < 0.72 and walkers(assets):  # of the kinds that move in other clips
-            shape = _pick(generator, walkers(assets), [])
+            shape = pick(generator, walkers(assets))
             pose = int(generator.integers(len(shape.vertices)))
             made.append(standing(shape, x, y, z, heading, tint(generator, 0.12), pose))
         else:
@@ -173,7 +173,7 @@ def _room(generator: np.random.Generator, assets: Assets, clutter: float) -> Pla
     ambient, colour = generator.uniform(0.4, 0.85), 1 + generator.uniform(-0.1, 0.1, 3)
     light = Light(np.array([*lamp, 0.92 * tall]), True, ambient, colour)
     reach, inside = (0.8, float(1.4 * max(half))), 0.88 * half
-    sky, eye = _sky(generator, assets), 0.85 * tall
+    sky, eye = pick(generator, assets.panoramas), 0.85 * tall
     place = Place(made, lambda x, y: 0.0 * x, spot, lane, reach, -inside, inside, eye, light, sky, True)
     count = round(clutter * generator.uniform(2, 3 + 3.5 * w * d / 4))
     made += _scatter(generator, assets, place, furniture(assets), count)
@@ -221,7 +221,7 @@ def _street(generator: np.random.Generator, assets: Assets, clutter: float) -> P
         across = draw.random() < 0.25
         return x, y, (draw.uniform(0, 2 * np.pi) if across else (0.0 if forth else np.pi))
 
-    high, sky = np.array([0.6 * length, edge]), _sky(generator, assets)
+    high, sky = np.array([0.6 * length, edge]), pick(generator, assets.panoramas)
     place = Place(made, height, spot, lane, (2.0, 18.0), -high, high, 3.5, _sun(generator), sky, False)
     poles = [s for s in _still(assets) if _SMALL < s.extent[2] < 10 and max(s.extent[:2]) < 2.5]
     things = poles + [s for s in furniture(assets) if s.extent[2] > 0.3]
@@ -231,11 +231,11 @@ def _street(generator: np.random.Generator, assets: Assets, clutter: float) -> P
             if vehicles(assets) and generator.random() < 0.35 * clutter:
                 y, x = sign * (road - 1.1), x + generator.uniform(-0.8, 0.8)
                 heading = (np.pi / 2 if sign > 0 else -np.pi / 2) + generator.uniform(-0.05, 0.05)
-                shape = _pick(generator, vehicles(assets), [])
-                made.append(standing(shape, x, y, float(height(np.array(x), np.array(y))), heading, tint(generator)))
+                shape = pick(generator, vehicles(assets))
+                made.append(standing(shape, x, y, place.ground(x, y), heading, tint(generator)))
     for _ in range(int(clutter * generator.uniform(0, 9))):
         x, y, _heading = spot(generator)
-        made += _tree(generator, assets, x, y, float(height(np.array(x), np.array(y))), generator.uniform(3, 8))
+        made += _tree(generator, assets, x, y, place.ground(x, y), generator.uniform(3, 8))
     return place
 
 
@@ -269,13 +269,13 @@ def _landscape(generator: np.random.Generator, assets: Assets, clutter: float) -
         x, y = draw.uniform(-5, 5, 2)
         return x, y, draw.uniform(0, 2 * np.pi)
 
-    limit, sky = np.array([0.25, 0.25]) * size, _sky(generator, assets)
+    limit, sky = np.array([0.25, 0.25]) * size, pick(generator, assets.panoramas)
     place = Place(made, height, spot, lane, (1.5, 16.0), -limit, limit, 3.5, _sun(generator), sky, False)
     houses = [s for s in _still(assets) if max(s.extent) > 4]
     made += _scatter(generator, assets, place, furniture(assets) + houses, round(clutter * generator.uniform(1, 10)))
     for _ in range(int(clutter * generator.uniform(2, 22))):
         x, y, heading = spot(generator)
-        z = float(height(np.array(x), np.array(y)))
+        z = place.ground(x, y)
         if generator.random() < 0.6:
             made += _tree(generator, assets, x, y, z, generator.uniform(1.5, 10))
         else:
@@ -318,4 +318,3 @@ def _tree(generator: np.random.Generator, assets: Assets, x: float, y: float, z:
 
 
 _PLACES = {"room": _room, "street": _street, "landscape": _landscape}
-__all__ = ["Place", "cutout", "furniture", "make_place", "standing", "surface", "tint", "vehicles", "walkers"]

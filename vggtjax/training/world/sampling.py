@@ -11,7 +11,7 @@ from vggtjax.training.world.assets import Assets
 from vggtjax.training.world.config import Cameras, Movers, Places, WorldConfig
 from vggtjax.training.world.meshes import Mesh, Surface, boulder, box, cutout, of_shape
 from vggtjax.training.world.motion import STEPS, Actor, CameraPath, wander
-from vggtjax.training.world.places import Place, furniture, surface, tint, vehicles, walkers
+from vggtjax.training.world.places import Place, furniture, pick, surface, tint, vehicles, walkers
 
 _FACING = np.pi / 2  # shapes look along -y; a heading of 0 is along x
 _GAIT = {"run": 3.2, "gallop": 5.5}  # metres a second; others walk
@@ -22,7 +22,7 @@ class Filmed(NamedTuple):
     """The camera of a clip and its lens."""
 
     path: CameraPath
-    half_angle: float  # of the horizontal field of view, radians
+    half_angle: float  # of the field of view along the longer side, radians
 
 
 def choose(generator: np.random.Generator, weights: Places | Cameras | Movers) -> str:
@@ -47,17 +47,17 @@ def draw_camera(
     kind = "walk" if kind == "follow" and not actors else kind
     middle = STEPS // 2
     if actors and (kind == "follow" or generator.random() < 0.8):
-        subject = actors[int(generator.integers(len(actors)))].place
+        subject = pick(generator, actors).place
         target = subject[middle] + [0, 0, generator.uniform(0.2, 1.3)]
     else:
         x, y, _ = place.spot(generator)
         subject = np.zeros((STEPS, 3))
-        target = np.array([x, y, float(place.height(np.array(x), np.array(y))) + generator.uniform(0.2, 1.6)])
+        target = np.array([x, y, place.ground(x, y) + generator.uniform(0.2, 1.6)])
     distance = np.exp(generator.uniform(*np.log(place.reach)))
     angle = generator.uniform(0, 2 * np.pi)
     start = np.clip(target[:2] + distance * np.array([np.cos(angle), np.sin(angle)]), place.low, place.high)
     eye = min(np.exp(generator.normal(np.log(1.45), 0.28)), place.ceiling)
-    centre = np.array([*start, float(place.height(*start)) + eye])
+    centre = np.array([*start, place.ground(*start) + eye])
     away = centre - target
     distance = max(float(np.linalg.norm(away)), 0.3)
     share = np.linspace(-0.5, 0.5, STEPS)[:, None]
@@ -106,20 +106,17 @@ def _actor(generator: np.random.Generator, assets: Assets, place: Place, kind: s
 
 
 def _walker(generator: np.random.Generator, assets: Assets, place: Place, seconds: float) -> Actor:
-    names = [name for name, shape in assets.shapes.items() if shape.rate]
-    name = names[int(generator.integers(len(names)))]
-    shape = assets.shapes[name]
+    name, shape = pick(generator, [item for item in assets.shapes.items() if item[1].rate])
     pace = generator.uniform(0.7, 1.3)
     speed = pace * next((value for gait, value in _GAIT.items() if gait in name), _WALK)
     speed = 0.0 if generator.random() < 0.12 else speed  # on the spot
     mesh, size = of_shape(shape, tint(generator, 0.15)), generator.uniform(0.8, 1.15)
     ground = _on_ground(generator, place, seconds, speed, generator.normal(0, 0.5), driven=False)
-    return _made(generator, mesh, shape.vertices * np.float32(size), shape.rate * pace, seconds, *ground)
+    return _made(generator, mesh, shape.vertices * np.asarray(size, np.float32), shape.rate * pace, seconds, *ground)
 
 
 def _vehicle(generator: np.random.Generator, assets: Assets, place: Place, seconds: float) -> Actor:
-    shapes = vehicles(assets)
-    shape = shapes[int(generator.integers(len(shapes)))]
+    shape = pick(generator, vehicles(assets))
     speed = np.exp(generator.uniform(np.log(0.8), np.log(12)))
     ground = _on_ground(generator, place, seconds, speed, generator.normal(0, 0.08), driven=True)
     return _made(generator, of_shape(shape, tint(generator)), shape.vertices, 0.0, seconds, *ground)
@@ -129,7 +126,7 @@ def _thing(generator: np.random.Generator, assets: Assets, place: Place, seconds
     """Return a rigid thing that slides, hops, hovers or tumbles."""
     draw, shapes = generator.random(), furniture(assets)
     if draw < 0.5 and shapes:
-        mesh = of_shape(shapes[int(generator.integers(len(shapes)))], tint(generator))
+        mesh = of_shape(pick(generator, shapes), tint(generator))
     else:
         size = np.exp(generator.uniform(np.log(0.15), np.log(1.2), 3))
         look = surface(generator, assets, "any", 0.5, 3)
@@ -146,12 +143,13 @@ def _thing(generator: np.random.Generator, assets: Assets, place: Place, seconds
 def _cutout(generator: np.random.Generator, assets: Assets, place: Place, seconds: float) -> Actor:
     """Return an upright piece of a photograph that slides and turns a little."""
     look = Surface(int(generator.choice(assets.materials["picture"])), gain=tint(generator, 0.1))
-    mesh = cutout(generator, *generator.uniform(0.4, 2.0, 2), look)
+    width, height = generator.uniform(0.4, 2.0, 2)
+    mesh = cutout(generator, width, height, look)
     speed = np.exp(generator.uniform(np.log(0.1), np.log(3)))
-    path, turn = _on_ground(generator, place, seconds, speed, 0.0, driven=False)
+    path, _ = _on_ground(generator, place, seconds, speed, 0.0, driven=False)
     path = path + np.array([0, 0, generator.uniform(0, 0.8)]) + wander(generator, 0.1, seconds, 0.3, 1.5, 3)
-    turn = turn * 0 + generator.uniform(0, 2 * np.pi) + wander(generator, 0.1, seconds, 0.2, 0.8, 3) * [1, 0.3, 0.3]
-    return _made(generator, mesh, mesh.vertices[None], 0.0, seconds, path, turn * [1, 0.05, 0.05])
+    turn = [generator.uniform(0, 2 * np.pi), 0, 0] + wander(generator, 0.1, seconds, 0.2, 0.8, 3) * [1, 0.05, 0.05]
+    return _made(generator, mesh, mesh.vertices[None], 0.0, seconds, path, turn)
 
 
 _KINDS = {"walker": _walker, "vehicle": _vehicle, "thing": _thing, "cutout": _cutout}

@@ -15,7 +15,7 @@ from vggtjax.training.world.motion import wander
 def expose(
     generator: np.random.Generator, light: Float[np.ndarray, "S H W 3"], config: WorldConfig, seconds: float
 ) -> UInt8[np.ndarray, "S H W 3"]:
-    """Return the pictures of a clip; all draws are the clip's own, noise and flicker each frame's."""
+    """Return the pictures of a clip: gain, vignette and quality are drawn once, noise and flicker for every frame."""
     S, H, W = light.shape[:3]
     level = float(np.median(light)) + 1e-3
     gain = np.clip(generator.uniform(0.25, 0.55) / level, 0.5, 2.5) ** 0.7
@@ -27,7 +27,7 @@ def expose(
     corner = 1 - generator.uniform(0, config.vignette) * radius
     pictures = light * exposure[:, None, None].astype(np.float32) * corner[..., None]
     grain = generator.uniform(0, config.noise)
-    pictures = pictures + generator.standard_normal(pictures.shape, np.float32) * np.float32(grain)
+    pictures = pictures + generator.standard_normal(pictures.shape, np.float32) * np.asarray(grain, np.float32)
     pictures = np.rint(255 * np.clip(pictures, 0, 1)).astype(np.uint8)
     if generator.random() < config.compression:
         quality = int(generator.integers(35, 95))
