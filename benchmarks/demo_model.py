@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as Bars
@@ -32,6 +33,7 @@ from vggtjax.progress import Progress
 from vggtjax.research.evaluation.ladder import LadderRow, MaskSource, ladder
 from vggtjax.storage.writing import staging, writing
 from vggtjax.training.scenes import SceneConfig, held_out_scenes
+from vggtjax.training.world.drawn import drawn_worlds
 
 CLIPS = Path(__file__).parents[2] / "shared" / "clips"
 SUPPRESS = ("zero", "drop")
@@ -77,6 +79,7 @@ class Settings:
     mask_pairs: int | None  # the number that the model recommends if None
     sweep: tuple[int, ...]
     training_scenes: int
+    assets: Path | None
 
     def __post_init__(self) -> None:
         lowest = {"static": 0, "dynamic": 0, "frames": 3, "mask_pairs": 0}
@@ -101,6 +104,7 @@ def demo_model(
     sweep: tuple[int, ...] = (1, 3, 5, 8, 12, 24),
     training_scenes: int = 256,
     clips: Path = CLIPS,
+    assets: Path | None = None,
 ) -> None:
     """Compare a model with guesses without images, and the methods with each other.
 
@@ -116,9 +120,10 @@ def demo_model(
         mask_pairs: pairs in which keys are suppressed; the number that the model recommends by default.
         sweep: further numbers of pairs to try on the first draw of dynamic scenes.
         training_scenes: number of training scenes behind the blind guesses.
+        assets: folder of textures, photographs and objects: the scenes are worlds of its test split instead of rooms.
         clips: folder with hololens/ and composite/ inside, filmed clips in the layout plain; absent ones are skipped.
     """
-    settings = Settings(static, dynamic, seeds, frames, height, mask_pairs, sweep, training_scenes)
+    settings = Settings(static, dynamic, seeds, frames, height, mask_pairs, sweep, training_scenes, assets)
     check_extra("plotting", "train", "matplotlib")  # before hours of measuring
     with staging(out):  # an unwritable folder fails now
         pass
@@ -128,6 +133,7 @@ def demo_model(
         results: dict[str, Any] = {
             "model": loaded.summary(),
             "settings": dataclasses.asdict(settings)
+            | {"assets": assets and assets.name}
             | {"height": bench.height, "mask_pairs": bench.pairs}
             | {"threshold": loaded.config.motion.cut_by(None, "otsu")},
         }
@@ -201,7 +207,12 @@ class _Bench:
         return Laddered(rows, summarise(main), summarise(swept), saliency_auc(rows))
 
     def scenes(self, kind: Literal["static", "dynamic"], count: int, seed: int) -> Truth:
-        config = SceneConfig(self.height, self.width, self.settings.frames, dynamic=kind == "dynamic")
+        frames, assets = self.settings.frames, self.settings.assets
+        if assets is not None:
+            shape = {"frames": frames, "height": self.height, "width": self.width}
+            worlds = [*drawn_worlds(assets, kind, count, split="test", seed=seed, **shape)]
+            return Truth(*(np.stack(arrays) for arrays in zip(*worlds, strict=True)))
+        config = SceneConfig(self.height, self.width, frames, dynamic=kind == "dynamic")
         return batched_truth(held_out_scenes(kind, count, config, seed=seed))
 
     def prior(self, height: int, width: int) -> Prior:

@@ -24,6 +24,7 @@ from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.storage import arrays
 from vggtjax.training.metrics import read_metrics
 from vggtjax.training.scenes.dataset import read_index
+from vggtjax.training.world.assets import read_object
 
 
 def _read_archive(path: Path) -> None:
@@ -80,6 +81,13 @@ _EVALUATION = {
     "mean": {"vggt": {"abs_rel": 0.1}},
     "seconds": {"vggt": {"depth": 0.5}},
 }
+_OBJECT = {
+    "vertices": np.random.default_rng(0).random((2, 4, 3), np.float32),
+    "faces": np.array([[0, 1, 2], [1, 2, 3]], np.int32),
+    "uv": np.zeros((4, 2), np.float32),
+    "texture": np.zeros((4, 4, 3), np.uint8),
+    "fps": np.float32(8),
+}
 _ARCHIVE = 2**26 + 2**23  # slack where an .npz is read: one of any size may declare 64 MiB
 
 
@@ -87,6 +95,7 @@ ROWS = (
     Reader("npz", made(lambda path: np.savez_compressed(path, **_ARRAYS), "arrays.npz"), _read_npz, _ARCHIVE),
     Reader("npy", file("array.npy", npy(np.ones((8, 6), np.float32))), arrays.read_array),
     Reader("result", made(lambda path: make_room(3).save_archive(path), "reconstruction.npz"), _read_archive, _ARCHIVE),
+    Reader("object of assets", made(lambda path: np.savez(path, **_OBJECT), "anim_walk.npz"), read_object, _ARCHIVE),
     Reader("metrics", file("metrics.csv", _METRICS), read_metrics),
     Reader("index of scenes", file("index.json", json.dumps(_SCENES)), lambda path: read_index(path.parent)),
     Reader("stored windows", _windows, _read_windows, _ARCHIVE),

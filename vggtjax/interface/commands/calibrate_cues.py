@@ -155,21 +155,10 @@ def _clips(
     if assets is None:
         yield from generated_clips(scenes, frames, size, seed)
         return
-    import numpy as np
+    from vggtjax.training.world.drawn import drawn_worlds
 
-    from vggtjax.clips.truth import Truth
-    from vggtjax.training.world.assets import read_assets
-    from vggtjax.training.world.casting import check_embree
-    from vggtjax.training.world.clip import world_clip
-    from vggtjax.training.world.config import WorldConfig
-
-    check_embree()
-    found, config = read_assets(assets), WorldConfig(dynamic=1.0)
     shape = {"frames": frames, "height": max(round(size * 9 / 16 / patch), 1) * patch, "width": size}
-    for scene in range(scenes):
-        clip = world_clip(found, config, (seed, _KEYS, scene), **shape)
-        truth = clip.depth, clip.dynamic_mask, clip.camera_from_world
-        yield Truth((clip.images / 255).astype("float32"), *truth, np.broadcast_to(clip.intrinsics, (frames, 3, 3)))
+    yield from drawn_worlds(assets, "dynamic", scenes, split="training", seed=seed, **shape)
 
 
 def generated_clips(scenes: int, frames: int, size: int, seed: int) -> Iterator[SyntheticClip]:

@@ -110,7 +110,7 @@ def read_assets(folder: str | Path, split: Split = "training") -> Assets:
 @functools.lru_cache(maxsize=2)
 def _read(folder: Path, split: Split) -> Assets:
     pictures, photos, panoramas, objects = chosen_files(folder, split)
-    meshes = {path.stem: _arrays(path) for path in objects}
+    meshes = {path.stem: read_object(path) for path in objects}
     images = [_square(read_image(path)) for path in (*pictures, *photos)]
     images += [_square(Image.fromarray(mesh["texture"])) for mesh in meshes.values()]
     materials = [*(_material(path) for path in pictures), *("photo" for _ in photos)]
@@ -252,8 +252,8 @@ def make_tiles(images: list[np.ndarray]) -> Tiles:
     return Tiles(np.concatenate(levels))
 
 
-def _arrays(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of an object's file, checked."""
+def read_object(path: Path) -> dict[str, np.ndarray]:
+    """Return the arrays of an object's file. Raises InputError unless they are a mesh."""
     names = ("vertices", "faces", "uv", "texture", "fps")
     try:
         headers = read_headers(path)
