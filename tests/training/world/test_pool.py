@@ -1,6 +1,8 @@
 """Clips of worlds in a run: drawn by step, kept in a folder, the same after an interruption."""
 
 import dataclasses
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -141,3 +143,10 @@ def test_recipes_that_cannot_be_drawn_are_refused(folder, tmp_path):
     missing = dataclasses.replace(recipe_of(folder), assets=str(tmp_path / "nowhere"))
     with pytest.raises(InputError, match="is not a folder"):
         train(missing, tmp_path / "out", task=Task(jnp.float32(1), make_batch, init_probes, objective, world_images))
+
+
+def test_renderers_do_not_import_jax():
+    """A process that renders starts in two seconds and takes no memory for a network."""
+    code = "import sys, vggtjax.training.world.pool; print('jax' in sys.modules)"
+    made = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert made.stdout == "False\n"
