@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +18,9 @@ _FIRST = 16  # clips of each size in the pool of the first step
 _WINDOW = 256  # of the newest clips of a size the clips of a step are drawn
 _AHEAD = 24  # steps whose clips are rendered before they come
 _STREAM = 1  # of the draws of clips, beside those of sizes
+
+
+logger = logging.getLogger(__name__)
 
 
 class Draw(NamedTuple):
@@ -43,6 +47,12 @@ class Worlds:
 
     def __init__(self, recipe: Recipe, pool: ClipPool, jobs: list[Job]) -> None:
         self._recipe, self._pool, self._jobs, self._asked = recipe, pool, jobs, -1
+
+    @property
+    def total(self) -> int:
+        """Number of clips that the pool has at the end of the run."""
+        batch, steps = max(phase.batch for phase in self._recipe.stages), self._recipe.total_steps
+        return sum(self._available(job, steps, batch) for job in self._jobs)
 
     def clips(self, step: int) -> PoolClip | None:
         """Return the clips of a step, or None for a step of scenes; those of the next steps are begun."""
@@ -91,7 +101,9 @@ def opened_worlds(recipe: Recipe, folder: Path, renderers: int = 1) -> Iterator[
         return
     jobs = list(dict.fromkeys(jobs))
     with ClipPool(folder, jobs, renderers) as pool:
-        yield Worlds(recipe, pool, jobs)
+        worlds = Worlds(recipe, pool, jobs)
+        logger.info("up to %d clips of worlds are rendered into %s, some 1 MB each", worlds.total, folder)
+        yield worlds
 
 
 def _job(recipe: Recipe, index: int, phase: Phase) -> Job:

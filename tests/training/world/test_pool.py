@@ -85,8 +85,10 @@ def test_pools_of_phases_grow_by_their_own_steps(folder, tmp_path):
     with opened_worlds(recipe, tmp_path) as worlds:
         assert worlds is not None
         first = [draw.numbers for step in range(1000, 1010) if (draw := worlds.draw(step)) is not None]
+        total = worlds.total
         drawn = [number for step in range(1400) if (draw := worlds.draw(step)) is not None for number in draw.numbers]
     assert max(max(row) for row in first) < 2 * 32 + 10 * 32
+    assert max(drawn) < total < 2 * max(drawn)
     assert 3 < len(drawn) / (len({*drawn}) + 16) < 8  # `reuse` is 4; two sizes have equal numbers
 
 
