@@ -33,7 +33,7 @@ from vggtjax.progress import Progress
 from vggtjax.research.evaluation.ladder import LadderRow, MaskSource, ladder
 from vggtjax.storage.writing import staging, writing
 from vggtjax.training.scenes import SceneConfig, held_out_scenes
-from vggtjax.training.world.drawn import drawn_worlds
+from vggtjax.training.world.truth import worlds_with_truth
 
 CLIPS = Path(__file__).parents[2] / "shared" / "clips"
 SUPPRESS = ("zero", "drop")
@@ -210,7 +210,7 @@ class _Bench:
         frames, assets = self.settings.frames, self.settings.assets
         if assets is not None:
             shape = {"frames": frames, "height": self.height, "width": self.width}
-            worlds = [*drawn_worlds(assets, kind, count, split="test", seed=seed, **shape)]
+            worlds = [*worlds_with_truth(assets, kind, count, split="test", seed=seed, **shape)]
             return Truth(*(np.stack(arrays) for arrays in zip(*worlds, strict=True)))
         config = SceneConfig(self.height, self.width, frames, dynamic=kind == "dynamic")
         return batched_truth(held_out_scenes(kind, count, config, seed=seed))

@@ -18,13 +18,13 @@ from vggtjax.errors import InputError, OutputError, VggtjaxError
 from vggtjax.network.checkpoint import read_model
 from vggtjax.network.model import init_params
 from vggtjax.training.checkpoints import latest
+from vggtjax.training.draws import draw_shape
 from vggtjax.training.loop import train
 from vggtjax.training.metrics import Averages, read_metrics, write_metrics
 from vggtjax.training.options import RunOptions
 from vggtjax.training.recipe import Phase, read_recipe
 from vggtjax.training.run import MOST_SKIPPED
 from vggtjax.training.state import exported
-from vggtjax.training.worlds import draw_shape
 
 NOW = 1e-9  # seconds: a run that ends after one step
 

@@ -47,13 +47,12 @@ def make_batch(key: Array, textures: Textures, phase: Phase, frames: int, patch_
     return Batch(clips) if regions is None else _suppressing(key, phase, clips, regions)
 
 
-def make_world_batch(key: Array, clips: PoolClip, phase: Phase, frames: int, patch_size: int) -> Batch:
+def make_world_batch(key: Array, clips: PoolClip, phase: Phase, frames: int) -> Batch:
     """Return the batch of clips of worlds, [phase.batch, frames, ...], in random colours.
 
     In a share `phase.masked_movers` of the clips in which something moves, its keys are suppressed. In clips at rest
-    those of random regions are, as in scenes. Pure; `phase`, `frames` and `patch_size` are static.
+    those of random regions are, as in scenes. Pure; `phase` and `frames` are static.
     """
-    del patch_size
     moving = jnp.asarray(clips.moving)
     moves = moving.any(axis=(1, 2, 3))
 

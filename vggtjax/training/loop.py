@@ -21,6 +21,7 @@ from vggtjax.network.layers import Params
 from vggtjax.storage.writing import locked_folder
 from vggtjax.training.data import make_batch as make_scene_batch
 from vggtjax.training.data import make_world_batch
+from vggtjax.training.draws import Worlds, draw_shape, opened_worlds
 from vggtjax.training.metrics import Row
 from vggtjax.training.objective import init_probes as init_scene_probes
 from vggtjax.training.objective import objective as scene_objective
@@ -30,7 +31,6 @@ from vggtjax.training.run import Run, labels_of, placement
 from vggtjax.training.scenes.textures import load_textures
 from vggtjax.training.start import adapted
 from vggtjax.training.state import Metrics, Objective, TrainingState, apply_gradient, loss_and_gradient
-from vggtjax.training.worlds import Worlds, draw_shape, opened_worlds
 
 GENERATED_NOTE = "model trained on generated scenes alone"
 _AHEAD = 2  # steps that the host may prepare while the device computes
@@ -71,7 +71,7 @@ class Task:
         make_batch: (key, textures, phase, frames, patch size) -> batch, with the last three static.
         init_probes: (seed, config) -> parameters of the objective alone.
         objective: (trained, batch, config, weights, *, compute_dtype, remat) -> loss, metrics.
-        make_world_batch: (key, clips of a pool, phase, frames, patch size) -> batch, for steps with worlds.
+        make_world_batch: (key, clips of a pool, phase, frames) -> batch, for steps with worlds; the last two static.
     """
 
     textures: Any = None
@@ -154,10 +154,8 @@ class _Trainer:
         textures = load_textures("training") if task.textures is None else task.textures
         self._run, self._objective = run, task.objective
         self._textures = jax.device_put(textures, where.whole)
-        self._make_batch, self._make_world_batch = (
-            jax.jit(make, static_argnums=(2, 3, 4), out_shardings=where.by_clip)
-            for make in (task.make_batch, task.make_world_batch)
-        )
+        self._make_batch = jax.jit(task.make_batch, static_argnums=(2, 3, 4), out_shardings=where.by_clip)
+        self._make_world_batch = jax.jit(task.make_world_batch, static_argnums=(2, 3), out_shardings=where.by_clip)
         self._worlds = worlds
         self._key = jax.random.key(run.recipe.data_seed)
         self._compiled: set[tuple[Phase, int]] = set()
@@ -174,8 +172,11 @@ class _Trainer:
         began = time.perf_counter()
         key = jax.random.fold_in(self._key, run.step)
         clips = self._worlds.clips(run.step) if self._worlds else None
-        make, data = (self._make_batch, self._textures) if clips is None else (self._make_world_batch, clips)
-        batch = wait(make(key, data, phase, frames, recipe.model.patch_size))
+        if clips is None:
+            batch = self._make_batch(key, self._textures, phase, frames, recipe.model.patch_size)
+        else:
+            batch = self._make_world_batch(key, clips, phase, frames)
+        wait(batch)
         rendered = time.perf_counter()
         metrics, gradient = _loss_and_gradient(run.state.trained, batch, recipe, self._objective)
         run.state, metrics = wait(_apply_gradient(run.state, gradient, metrics, recipe))

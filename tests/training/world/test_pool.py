@@ -13,6 +13,7 @@ from tests.shared.asset_folder import write_assets
 from tests.shared.training_runs import PROBES, init_probes, make_batch, objective, same
 from vggtjax.errors import InputError, VggtjaxError
 from vggtjax.training.data import make_world_batch
+from vggtjax.training.draws import Worlds, opened_worlds
 from vggtjax.training.loop import Task, train
 from vggtjax.training.options import RunOptions
 from vggtjax.training.recipe import Phase
@@ -20,7 +21,6 @@ from vggtjax.training.scenes.config import SceneConfig
 from vggtjax.training.world.config import Places, WorldConfig
 from vggtjax.training.world.dataset import write_worlds
 from vggtjax.training.world.pool import ClipPool, Job
-from vggtjax.training.worlds import Worlds, opened_worlds
 
 ROOMS = WorldConfig(places=Places(1, 0, 0), dynamic=1.0)
 PHASE = Phase(4, 2, (2, 3), 28, 28, worlds=0.7, world=ROOMS, suppressed=0.5, masked_movers=1.0)
@@ -42,9 +42,9 @@ def recipe_of(folder):
     return dataclasses.replace(PROBES, stages=(PHASE,), assets=str(folder))
 
 
-def world_images(key, clips, phase, frames, patch_size):
+def world_images(key, clips, phase, frames):
     """The pictures alone, as the small objective of these tests takes them."""
-    del key, phase, frames, patch_size
+    del key, phase, frames
     return jnp.asarray(clips.images, jnp.float32) / 255
 
 
@@ -115,10 +115,10 @@ def test_frames_are_taken_in_the_order_that_is_asked_for(clips, folder, tmp_path
 
 
 def test_keys_of_what_moves_are_suppressed(clips):
-    make = jax.jit(make_world_batch, static_argnums=(2, 3, 4))
-    batch = make(jax.random.key(0), clips, PHASE, 3, 14)
+    make = jax.jit(make_world_batch, static_argnums=(2, 3))
+    batch = make(jax.random.key(0), clips, PHASE, 3)
     np.testing.assert_array_equal(batch.regions, clips.moving)
-    never = make(jax.random.key(0), clips, dataclasses.replace(PHASE, masked_movers=0.0), 3, 14)
+    never = make(jax.random.key(0), clips, dataclasses.replace(PHASE, masked_movers=0.0), 3)
     assert not never.regions.any()
     assert batch.clips.images.min() >= 0
     assert batch.clips.images.max() <= 1

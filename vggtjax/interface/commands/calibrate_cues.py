@@ -155,10 +155,10 @@ def _clips(
     if assets is None:
         yield from generated_clips(scenes, frames, size, seed)
         return
-    from vggtjax.training.world.drawn import drawn_worlds
+    from vggtjax.training.world.truth import worlds_with_truth
 
     shape = {"frames": frames, "height": max(round(size * 9 / 16 / patch), 1) * patch, "width": size}
-    yield from drawn_worlds(assets, "dynamic", scenes, split="training", seed=seed, **shape)
+    yield from worlds_with_truth(assets, "dynamic", scenes, split="training", seed=seed, **shape)
 
 
 def generated_clips(scenes: int, frames: int, size: int, seed: int) -> Iterator[SyntheticClip]:

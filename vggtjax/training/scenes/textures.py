@@ -12,6 +12,7 @@ from PIL import Image
 
 from vggtjax.errors import check_choice
 from vggtjax.training.scenes.config import Split
+from vggtjax.training.scenes.pyramid import texels
 
 SIDES = (256, 128, 64, 32, 16)  # pyramid of a tile, finest first
 PHOTOGRAPHS = (
@@ -42,12 +43,7 @@ def load_textures(split: Split = "training") -> Textures:
     generator = np.random.default_rng(SEEDS[split])
     tiles = [tile for name in PHOTOGRAPHS for tile in _crops(name, split, generator)]
     tiles += [_procedural(generator, kind) for kind in range(PROCEDURAL)]
-    levels = [
-        np.asarray(Image.fromarray(tile).resize((side, side), Image.Resampling.BOX)).reshape(-1, 3)
-        for side in SIDES
-        for tile in tiles
-    ]
-    return Textures(jnp.asarray(np.concatenate(levels)))
+    return Textures(jnp.asarray(texels(tiles, SIDES)))
 
 
 def sample(

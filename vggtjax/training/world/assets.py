@@ -24,6 +24,7 @@ from vggtjax.clips.media.images import read_image
 from vggtjax.errors import InputError, ResultError
 from vggtjax.storage.arrays import read_arrays, read_headers
 from vggtjax.training.scenes.config import Split
+from vggtjax.training.scenes.pyramid import texels
 
 KINDS = ("textures", "photos", "objects")
 SIDES = (128, 64, 32, 16, 8)  # pyramid of a tile, finest first
@@ -244,12 +245,7 @@ def _square(image: Image.Image) -> np.ndarray:
 
 def make_tiles(images: list[np.ndarray]) -> Tiles:
     """Return square pictures of SIDES[0] pixels with their pyramids."""
-    levels = [
-        np.asarray(Image.fromarray(image).resize((side, side), Image.Resampling.BOX)).reshape(-1, 3)
-        for side in SIDES
-        for image in images
-    ]
-    return Tiles(np.concatenate(levels))
+    return Tiles(texels(images, SIDES))
 
 
 def read_object(path: Path) -> dict[str, np.ndarray]:

@@ -18,7 +18,7 @@ from vggtjax.training.world.config import WorldConfig
 _STREAMS = {"static": 0x7374696C, "dynamic": 0x6D6F7665}  # beside a seed, so that no other use of it draws these clips
 
 
-def drawn_worlds(
+def worlds_with_truth(
     assets: str | Path, kind: Kind, count: int, *, split: Split, seed: int, frames: int, height: int, width: int
 ) -> Iterator[Truth]:
     """Yield clips [S, ...] of the worlds of a folder of assets; a larger count begins with those of a smaller one.
