@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -55,6 +56,7 @@ class Compared:
     rows: list[LadderRow]
     guesses: list[Guess]
     comparisons: list[Comparison]
+    known_cameras: list[Summary]  # of a network that reads them: without and with the true ones
 
 
 @dataclasses.dataclass(frozen=True)
@@ -191,9 +193,13 @@ class _Bench:
     def compared(self, name: str, clips: Windows) -> Compared:
         names, truth = clips
         prior = self.prior(truth.images.shape[2], truth.images.shape[3])
-        rows = ladder(self.model, truth, methods=["vggt"], batch_size=_AT_ONCE, progress=self.stage(name))
+        plain = partial(ladder, self.model, truth, methods=["vggt"], batch_size=_AT_ONCE)
+        rows, given = plain(progress=self.stage(name)), []
+        if self.model.config.reads_cameras:
+            told = plain(known_cameras=True, progress=self.stage(f"{name}, known cameras"))
+            given = summarise([[*rows, *(dataclasses.replace(row, method="known cameras") for row in told)]])
         guessed = guesses(truth, prior)
-        return Compared(names, rows, guessed, compare(rows, guessed))
+        return Compared(names, rows, guessed, compare(rows, guessed), given)
 
     def laddered(self, name: str, truths: Iterable[Truth]) -> Laddered:
         settings, rows = self.settings, []
@@ -236,6 +242,9 @@ def report_text(model: Model, results: dict[str, Any]) -> str:
         if compared := results[name]:
             parts += [f"## Plain pass against blind guesses: {name}, {len(compared.clips)} clips"]
             parts += [comparison_table(compared.comparisons), *_failures(compared.rows)]
+            if given := compared.known_cameras:
+                parts += [f"## The network reads true cameras: {name}", ladder_table(given), "Changes:"]
+                parts += [changes_table(given)]
     if results["composite ladder"] or results["dynamic"]:
         parts += ["## How to read the tables of methods", _READING]
     for name in ("composite ladder", "dynamic"):

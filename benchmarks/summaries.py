@@ -24,6 +24,7 @@ METRICS = {  # fields of LadderRow, and their names in tables and plots
     "point_distance_first": "points, first camera",
     "mask_jaccard": "mask J",
 }
+FIRST = "vggt"  # the plain pass
 # compared with the plain pass
 AGAINST_FIRST = ("abs_rel", "rotation_error", "centre_error", "point_distance", "point_distance_first")
 
@@ -93,7 +94,7 @@ def summarise(by_seed: Sequence[Sequence[LadderRow]]) -> list[Summary]:
         draws = [draw for rows in by_seed if (draw := _draw(rows, setting)).rows]
         scores = {name: [_mean(draw.rows, name) for draw in draws] for name in METRICS}
         ratios = {name: [_ratio(draw, name) for draw in draws] for name in AGAINST_FIRST}
-        changes = {name: _change(draws, name) for name in AGAINST_FIRST if setting[1] is not None}
+        changes = {name: _change(draws, name) for name in AGAINST_FIRST if setting[0] != FIRST}
         found.append(
             Summary(
                 *setting,
@@ -109,7 +110,7 @@ def summarise(by_seed: Sequence[Sequence[LadderRow]]) -> list[Summary]:
 
 def saliency_auc(by_seed: Sequence[Sequence[LadderRow]]) -> Spread | None:
     """Return the first pass's saliency AUC, clip by clip and seed by seed; None where no clip has one."""
-    plain = [[row for row in rows if row.mask_source is None] for rows in by_seed]
+    plain = [[row for row in rows if row.method == FIRST] for rows in by_seed]
     means = [_mean(rows, "saliency_auc") for rows in plain]
     return spread(there) if (there := [mean for mean in means if mean is not None]) else None
 
@@ -181,7 +182,7 @@ def _draw(rows: Sequence[LadderRow], setting: tuple[str, str | None, int | None,
     alike = [row for row in rows if _setting(row)[1:] == setting[1:]]
     rivals = [[row for row in alike if row.method == method] for method in dict.fromkeys(row.method for row in alike)]
     own = [row for row in alike if row.method == setting[0]]
-    return _Draw(own, [row for row in rows if row.mask_source is None], rivals)
+    return _Draw(own, [row for row in rows if row.method == FIRST], rivals)
 
 
 def _setting(row: LadderRow) -> tuple[str, str | None, int | None, str | None]:

@@ -10,13 +10,17 @@ from scipy.spatial.transform import Rotation
 from benchmarks import __main__ as benchmarks
 from benchmarks import demo_model
 from benchmarks.blind_guesses import Prior, compare, guesses, mean_depth_map
-from benchmarks.real_clips import load_windows, window_starts
+from benchmarks.real_clips import Windows, load_windows, window_starts
 from benchmarks.summaries import changes_table, comparison_table, ladder_table, saliency_auc, spread, summarise
 from tests.benchmarks.scenes import SIDE, drawn_scenes, row, tiny_file
+from tests.shared.da3 import TINY
 from tests.shared.dataset_files import write_plain
 from tests.shared.tiny import tiny_config
 from vggtjax.clips.truth import Truth
 from vggtjax.errors import InputError
+from vggtjax.network.checkpoint import Model
+from vggtjax.network.model import init_params
+from vggtjax.training.scenes import SceneConfig
 
 FRAMES = 3
 
@@ -109,6 +113,23 @@ def test_a_small_run_of_everything(tmp_path, capsys, monkeypatch):
     assert len(report["dynamic"]["summaries"]) == 1 + 3 * 2
     for name in ("dynamic-zero", "dynamic-sweep-4dvggt-d", "composite-ladder-zero"):
         assert (out / f"{name}.png").is_file()
+
+
+def test_known_cameras_are_compared_with_none(monkeypatch):
+    monkeypatch.setattr(demo_model, "training_prior", lambda *_, **__: Prior(np.full((SIDE, SIDE), 2.0), np.zeros(3)))
+    config = replace(TINY, image_size=SIDE)
+    bench = demo_model._Bench(
+        Model(config, init_params(0, config), "reader"), demo_model.Settings(2, 0, 1, FRAMES, None, None, (), 1, None)
+    )
+    truth = Truth(
+        *(getattr(drawn_scenes("static", 2, SceneConfig(SIDE, SIDE, FRAMES)), name) for name in Truth._fields)
+    )
+    plain, told = bench.compared("static", Windows(["a", "b"], truth)).known_cameras
+    assert (plain.method, told.method, told.clips) == ("vggt", "known cameras", 2)
+    assert plain.changes == {}
+    change = told.scores["abs_rel"].mean - plain.scores["abs_rel"].mean
+    assert change != 0
+    assert told.changes["abs_rel"].mean == pytest.approx(change)
 
 
 def test_summaries_by_hand():

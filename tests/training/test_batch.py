@@ -6,11 +6,13 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from scipy import ndimage
 from skimage.measure import label
 
 from tests.shared.aggregation import aggregate
+from tests.shared.da3 import TINY as DA3
 from tests.shared.generated import QUICK, textures
 from tests.shared.training_runs import CONFIG
 from vggtjax.network.aggregator import identity
@@ -29,8 +31,8 @@ WEIGHTS = LossWeights(depth=0, points=0, match=1, match_layers=(1,), probe=1, mo
 render = jax.jit(make_batch, static_argnums=(2, 3, 4), compiler_options=QUICK)
 
 
-def drawn(phase, key=0):
-    return render(jax.random.key(key), textures(), phase, 2, CONFIG.patch_size)
+def drawn(phase, key=0, frames=2):
+    return render(jax.random.key(key), textures(), phase, frames, CONFIG.patch_size)
 
 
 @pytest.fixture(scope="module")
@@ -131,3 +133,30 @@ def test_moments_of_too_few_patches_are_not_known():
     made, known = _flow_moments(zeros, zeros, jnp.ones((1, 1, 4)), jnp.asarray(seen))
     assert not known.any()
     assert np.isfinite(made).all()
+
+
+def test_known_cameras_are_read_and_their_encoder_learns():
+    """The loss depends on the encoder where it is read, and on no unit of length; else the encoder has no gradient."""
+    config = dataclasses.replace(DA3, image_size=28)
+    trained = {"model": init_params(0, config), "probes": init_probes(0, config)}
+    batch = drawn(dataclasses.replace(PHASE, known_cameras=1.0), frames=3)
+    assert batch.known_cameras
+    assert not drawn(dataclasses.replace(PHASE, known_cameras=0.5)).known_cameras
+
+    @partial(jax.jit, compiler_options=QUICK)
+    def gradient(model, batch):
+        def loss(model):
+            return objective(trained | {"model": model}, batch, config, LossWeights(depth=0, points=0))[0]
+
+        value, slope = jax.value_and_grad(loss)(model)
+        return value, optax.tree.norm(slope["camera_encoder"])
+
+    loss, slope = gradient(trained["model"], batch)
+    assert slope > 0
+    unit = jnp.array([[[[1, 1, 1, 100.0]]]])
+    larger = batch.clips._replace(camera_from_world=batch.clips.camera_from_world * unit, depth=100 * batch.clips.depth)
+    again, _ = gradient(trained["model"], dataclasses.replace(batch, clips=larger))
+    assert float(again) == pytest.approx(float(loss), rel=1e-4)
+    plain, slope = gradient(trained["model"], dataclasses.replace(batch, known_cameras=False))
+    assert plain != loss
+    assert slope == 0

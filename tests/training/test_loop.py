@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.shared.da3 import TINY
 from tests.shared.training_runs import PROBES, SHORT, TASK, measured, same
 from vggtjax.errors import InputError, OutputError, VggtjaxError
 from vggtjax.network.checkpoint import read_model
@@ -21,6 +22,7 @@ from vggtjax.training.checkpoints import latest
 from vggtjax.training.draws import draw_shape
 from vggtjax.training.loop import train
 from vggtjax.training.metrics import Averages, read_metrics, write_metrics
+from vggtjax.training.objective import LossWeights
 from vggtjax.training.options import RunOptions
 from vggtjax.training.recipe import Phase, read_recipe
 from vggtjax.training.run import MOST_SKIPPED
@@ -127,6 +129,11 @@ def test_frames_and_sizes_depend_on_seed_and_step_alone():
     assert shapes == drawn(phase, 0) != drawn(phase, 1)
     assert {frames for frames, *_ in shapes} == {2, 3, 5}
     assert {tuple(size) for _, *size in shapes} == {(28, 28), (14, 28), (28, 42)}
+    given = (dataclasses.replace(phase, known_cameras=0.3),)
+    recipe = dataclasses.replace(SHORT, stages=given, model=TINY, losses=LossWeights(points=0))
+    told = [draw_shape(recipe, step)[1].known_cameras for step in range(60)]
+    assert set(told) == {0, 1}
+    assert 0.15 < np.mean(told) < 0.45
     alone = drawn(dataclasses.replace(phase, sizes=()), 0)  # further sizes leave the numbers of frames as they were
     assert [frames for frames, *_ in alone] == [frames for frames, *_ in shapes]
 

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.shared.da3 import TINY
 from tests.shared.training_runs import RECIPE
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
@@ -64,12 +65,20 @@ def test_other_numbers_of_steps_keep_the_shares(steps):
         (changed(stages=[PHASE | {"pitch": [0, 70]}]), r"stages\[0\]: pitch\[1\] is 70.0; expected a number"),
         (changed(stages=[PHASE | {"suppressed_pairs": [0.5, 0.2]}]), r"suppressed_pairs is \(0.5, 0.2\); expected"),
         (changed(stages=[PHASE | {"sizes": [[28, 42]]}]), r"sizes is .*; expected sizes other than \(28, 42\)"),
+        (changed(stages=[PHASE | {"known_cameras": 0.5}]), "a phase has known_cameras and the model, of family vggt"),
         (changed(untrained=["neck"]), r"recipe.untrained has \['neck'\]"),
     ],
 )
 def test_bad_recipes_are_named(text, says):
     with pytest.raises(InputError, match=says):
         Recipe.from_json(text)
+
+
+def test_the_camera_encoder_learns_only_where_it_is_read():
+    recipe = dataclasses.replace(RECIPE, model=TINY, untrained=(), losses=LossWeights(points=0))
+    stages = tuple(dataclasses.replace(stage, known_cameras=0.3) for stage in recipe.stages)
+    assert recipe.frozen == ("camera_encoder",)
+    assert dataclasses.replace(recipe, stages=stages).frozen == ()
 
 
 DOCS = Path(__file__).parents[2] / "docs"

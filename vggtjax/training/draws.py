@@ -32,14 +32,16 @@ class Draw(NamedTuple):
 
 
 def draw_shape(recipe: Recipe, step: int) -> tuple[int, Phase, int]:
-    """Return the index of a step's phase, the phase with one of its sizes, and one of its numbers of frames.
+    """Return the index of a step's phase, the phase as the step has it, and one of its numbers of frames.
 
-    The draw depends on the data seed and the step alone.
+    A step has one of the phase's sizes, and known cameras or none. The draw depends on the data seed and the step
+    alone.
     """
     index, phase = recipe.phase_at(step)
     generator = np.random.default_rng((recipe.data_seed, step))
     frames = int(generator.choice(phase.frames))
-    return index, phase.of_size(int(generator.integers(len(phase.all_sizes)))), frames
+    phase = phase.of_size(int(generator.integers(len(phase.all_sizes))))
+    return index, phase.with_cameras(known=generator.random() < phase.known_cameras), frames
 
 
 class Worlds:

@@ -13,10 +13,11 @@ from jaxtyping import Array, Bool, Float
 
 from vggtjax.config import Suppress, VGGTConfig
 from vggtjax.network.aggregator import Aggregator
-from vggtjax.network.backbone import encode, patch_grid
+from vggtjax.network.backbone import ClipBatch, encode, patch_grid
+from vggtjax.network.heads.camera_encoder import encode_cameras
 from vggtjax.network.heads.camera_head import predict_pose
 from vggtjax.network.heads.dpt_head import DENSE_HEADS, predict_dense, project_tap
-from vggtjax.network.heads.pose import quaternion_to_matrix
+from vggtjax.network.heads.pose import encode_pose, quaternion_to_matrix
 from vggtjax.network.layers import LayerNorm, Params
 from vggtjax.network.model import HEADS, tap_patches
 from vggtjax.network.precision import Compute, full_precision
@@ -31,7 +32,11 @@ CONFIDENCE = 0.2  # weight of the logarithm of confidence, as in VGGT
 _NEAR = 0.1  # in mean distances: nearer points count as ones so near where errors are relative
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=("clips", "regions", "pairs"), meta_fields=("suppress",))
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("clips", "regions", "pairs"),
+    meta_fields=("suppress", "known_cameras"),
+)
 @dataclass(frozen=True)
 class Batch:
     """The clips of a step, and the random regions in which their keys are suppressed: a pytree.
@@ -41,12 +46,14 @@ class Batch:
         regions: pixels of suppressed patches; None for no suppression in any clip.
         pairs: share of the pairs of blocks, from the first, that suppress keys, in (0, 1]; the same for all clips.
         suppress: how keys are suppressed; static under jit.
+        known_cameras: whether the network reads the true cameras; static under jit.
     """
 
     clips: Clips
     regions: Bool[Array, "B S H W"] | None = None
     pairs: Float[Array, " B"] | None = None
     suppress: Suppress = "zero"
+    known_cameras: bool = False
 
     def suppression(self, config: VGGTConfig) -> Suppression:
         """Return the suppression of the network's keys: a patch is suppressed if its middle pixel is."""
@@ -141,11 +148,19 @@ def objective(
 
     captures = [capture(slot) for slot in range(len(config.taps))]
     compute = Compute(compute_dtype, reference="first")  # the targets are in its camera
+    given = None
+    if batch.known_cameras:
+        H, W = images.shape[2:4]
+        cameras = encode_pose(clips.camera_from_world, clips.intrinsics, (H, W))
+        given = ClipBatch(images, cameras=cameras)
 
     def network(model: Params):
+        known = None if given is None else encode_cameras(model, given, config, compute_dtype=compute_dtype)
         features = encode(model, images, config, compute_dtype=compute_dtype)
         settings = {"accumulator": matching, "suppression": batch.suppression(config), "compute": compute}
-        return Aggregator(config).apply({"params": model["aggregator"]}, features, grid, captures, **settings)
+        return Aggregator(config).apply(
+            {"params": model["aggregator"]}, features, grid, captures, camera_tokens=known, **settings
+        )
 
     made: Any = (jax.checkpoint(network) if remat else network)(model)
     camera_tokens, taps, sums = made

@@ -65,6 +65,7 @@ class Phase:
     world: WorldConfig = field(default_factory=WorldConfig)
     reuse: Positive = 4.0  # how often a clip of a world is drawn, on average
     masked_movers: Share = 0.6  # share of moving clips of worlds in which the keys of what moves are suppressed
+    known_cameras: Share = 0.0  # share of steps in which the network reads the true cameras
 
     def __post_init__(self) -> None:
         check_fields(self, "phase")
@@ -87,6 +88,10 @@ class Phase:
         """Return the phase with one of `all_sizes` alone."""
         height, width = self.all_sizes[index]
         return dataclasses.replace(self, height=height, width=width, sizes=()) if self.sizes else self
+
+    def with_cameras(self, *, known: bool) -> Phase:
+        """Return the phase with known cameras in all steps or in none."""
+        return dataclasses.replace(self, known_cameras=float(known)) if 0 < self.known_cameras < 1 else self
 
     def scenes(self, frames: int) -> SceneConfig:
         """Return the configuration of scenes of `frames` frames. Raises InputError for invalid values."""
@@ -180,6 +185,11 @@ class Recipe:
                 )
         if not self.assets and any(phase.worlds for phase in self.stages):
             raise InputError("a phase has worlds and recipe.assets is empty; expected the folder of their assets")
+        if self.reads_cameras and not self.model.reads_cameras:
+            raise InputError(
+                f"a phase has known_cameras and the model, of family {self.model.family} with camera_depth "
+                f"{self.model.camera_depth}, does not read any; leave known_cameras out"
+            )
         new, last = self.start.new_pairs, self.model.depth - 1
         if len(set(new)) < len(new) or any(pair >= last or pair in self.model.taps for pair in new):
             raise InputError(
@@ -211,8 +221,15 @@ class Recipe:
     def frozen(self) -> tuple[str, ...]:
         """Modules of the model that stay unchanged."""
         absent = {module for name, module in HEADS.items() if name not in self.model.heads}
-        untrained = (name for name in self.untrained if name not in absent)
+        untrained = [name for name in self.untrained if name not in absent]
+        if self.model.reads_cameras and not self.reads_cameras:
+            untrained.append("camera_encoder")
         return (*(("backbone", "aggregator") if self.trainable == "heads" else ()), *untrained)
+
+    @property
+    def reads_cameras(self) -> bool:
+        """Whether the network reads true cameras in some steps."""
+        return any(phase.known_cameras for phase in self.stages)
 
     @property
     def total_steps(self) -> int:

@@ -2,19 +2,23 @@ import re
 from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tests.shared.da3 import TINY
 from tests.shared.seeded import seeded_images
 from tests.shared.tiny import tiny_config
-from vggtjax import Reconstruction, assemble, infer, init_params, load_clip
+from vggtjax import Reconstruction, assemble, forward, infer, init_params, load_clip
 from vggtjax.cameras import checked_centres, umeyama_sim3
 from vggtjax.clips.truth import Truth
+from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.method.mask import upsample
 from vggtjax.method.passes import Passes
 from vggtjax.network.checkpoint import Model
+from vggtjax.network.heads.pose import encode_pose
 from vggtjax.options import ABLATION
 from vggtjax.pipeline.fields import clip_fields
 from vggtjax.research.evaluation.ladder import LadderRow, error_table, ladder, score_result, second_pass_in_words
@@ -26,16 +30,19 @@ CLIPS, FRAMES, SIZE = 3, 4, (28, 42)
 SETTING = ("method", "mask_source", "mask_pairs", "suppress")
 
 
-@pytest.fixture(scope="module")
-def model() -> Model:
+def tiny_model(config: VGGTConfig) -> Model:
     def louder(path, leaf):  # let what attention sees matter
         return leaf + 0.3 if path[-1].key in ("scale1", "scale2") else leaf
 
-    config = tiny_config()
     params = init_params(3, config)
     for blocks in ("frame_blocks", "global_blocks"):
         params["aggregator"][blocks] = jax.tree_util.tree_map_with_path(louder, params["aggregator"][blocks])
     return Model(config, params, "tiny")
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    return tiny_model(tiny_config())
 
 
 @pytest.fixture(scope="module")
@@ -165,6 +172,20 @@ def test_options_of_other_methods_are_refused(model, truth):
     for name, value in {"method": "vggt", "mask": "matches", "refine_mask": True}.items():
         with pytest.raises(InputError, match=f"options have {name} "):
             ladder(model, truth, **{name: value})
+
+
+def test_true_cameras_go_into_a_network_that_reads_them(model, truth):
+    config = replace(TINY, image_size=42)
+    reader, first = tiny_model(config), Truth(*(array[:1] for array in truth))
+    rows = [ladder(reader, first, methods=["vggt"], known_cameras=known)[0] for known in (False, True)]
+    cameras = encode_pose(jnp.asarray(first.camera_from_world), jnp.asarray(first.intrinsics), SIZE)
+    images = jnp.asarray(first.images, jnp.float32)
+    depth = np.asarray(forward(reader.params, images, config, cameras=cameras).depth)[0]
+    expected = depth_errors(depth, first.depth[0], scale=median_scale(depth, first.depth[0])).abs_rel
+    assert rows[1].abs_rel == pytest.approx(expected, rel=1e-4)
+    assert rows[0].abs_rel != pytest.approx(expected, rel=1e-4)
+    with pytest.raises(InputError, match="cameras are given, and this network reads none"):
+        ladder(model, first, methods=["vggt"], known_cameras=True)
 
 
 def test_a_model_gone_wrong_is_a_row_that_says_so(model, truth):

@@ -22,6 +22,7 @@ from vggtjax.method.mask import upsample
 from vggtjax.method.matching.matched_mask import motion_pixels
 from vggtjax.method.passes import Passes
 from vggtjax.network.checkpoint import Model
+from vggtjax.network.heads.pose import encode_pose
 from vggtjax.options import ABLATION, Options, find_method
 from vggtjax.pipeline.steps import Execute
 from vggtjax.progress import Progress
@@ -94,6 +95,7 @@ def ladder(
     suppress: Sequence[Suppress] = ("zero",),
     options: Options = Options(compute_dtype="float32"),
     batch_size: int = 4,
+    known_cameras: bool = False,
     progress: Progress | None = None,
     **changes: Any,
 ) -> list[LadderRow]:
@@ -110,6 +112,7 @@ def ladder(
         suppress: ways to suppress them, in place of the methods' own.
         options: the other settings, such as `gram` or the threshold of mined masks.
         batch_size: number of clips that go through the network together.
+        known_cameras: the network reads the true cameras.
         progress: called with the number of passes done and of all passes.
         changes: fields of `options` by name, such as `gram="dot"`.
 
@@ -117,8 +120,8 @@ def ladder(
         Rows in the order of clips, then mask, pairs, suppression and method; methods without a second pass come first.
 
     Raises:
-        InputError: an unknown name, or shapes that do not fit. A prediction that cannot be scored is not an error: its
-            row has the reason.
+        InputError: an unknown name, shapes that do not fit, or known cameras for a network that reads none. A
+            prediction that cannot be scored is not an error: its row has the reason.
     """
     truth = batched_truth(truth)
     if foreign := [method for method in methods if find_method(method) and method not in ABLATION]:
@@ -144,7 +147,12 @@ def ladder(
 
     rows: list[LadderRow] = []
     for clips, padded in batches:
-        batch = Clips(jax.device_put(truth.images[padded].astype(np.float32, copy=False)))
+        images = jax.device_put(truth.images[padded].astype(np.float32, copy=False))
+        cameras = None
+        if known_cameras:
+            poses, intrinsics = jax.device_put((truth.camera_from_world[padded], truth.intrinsics[padded]))
+            cameras = encode_pose(poses, intrinsics, truth.images.shape[2:4])
+        batch = Clips(images, cameras=cameras)
         scenes = [_scene(int(clip), truth) for clip in clips]
         true_masks = jax.device_put(truth.dynamic_mask[padded])
         shared, by_setting = None, {}
