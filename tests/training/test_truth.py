@@ -12,7 +12,7 @@ from vggtjax.network.heads.pose import decode_pose
 from vggtjax.training.matching import MatchLoss, match_loss
 from vggtjax.training.objective import dense_loss
 from vggtjax.training.scenes import SyntheticClip
-from vggtjax.training.truth import OCCLUDED, Matches, clips_of, match_counts, matches, targets
+from vggtjax.training.truth import OCCLUDED, Matches, clips_of, match_counts, matches, mirrored, targets
 
 PATCH = 4
 CENTRE = slice(PATCH // 2, None, PATCH)
@@ -245,3 +245,25 @@ def test_dense_loss_by_hand():
     assert float(loss) == pytest.approx(expected, rel=1e-6)
     with_slope = dense_loss(shaped[0][..., None], shaped[1], shaped[2][..., None], 1.0, shaped[3])
     assert float(with_slope) == pytest.approx(expected + (1.0 * 0.5 + 0.25 * 1.0) / 2, rel=1e-6)
+
+
+def test_a_mirrored_clip_is_a_mirrored_world(clip, found):
+    @partial(jax.jit, compiler_options=QUICK)
+    def seen(scenes):
+        turned = mirrored(clips_of(scenes, PATCH))
+        return turned.images, targets(turned), matches(turned, PATCH)
+
+    scenes = jax.tree.map(jnp.asarray, clip)
+    images, truth, paired = jax.device_get(seen(scenes))
+    plain = jax.device_get(quick_targets(scenes))
+    np.testing.assert_array_equal(images, clip.images[:, :, :, ::-1])
+    np.testing.assert_allclose(truth.depth, plain.depth[..., ::-1], rtol=1e-5)
+    np.testing.assert_allclose(truth.points, plain.points[:, :, :, ::-1] * np.array([-1, 1, 1]), atol=2e-5)
+
+    def turned(values):
+        """Of patches whose columns are exchanged."""
+        w = clip.depth.shape[3] // PATCH
+        return values.reshape(*values.shape[:3], -1, w, *values.shape[4:])[:, :, :, :, ::-1].reshape(values.shape)
+
+    np.testing.assert_allclose(paired.position, turned(found.position) * np.array([-1, 1]), atol=2e-5)
+    assert (paired.visible == turned(found.visible)).mean() > 0.999

@@ -13,10 +13,11 @@ from vggtjax.training.objective import Batch
 from vggtjax.training.recipe import Phase
 from vggtjax.training.scenes.render import SyntheticClip, generate
 from vggtjax.training.scenes.textures import Textures
-from vggtjax.training.truth import Clips, clips_of
+from vggtjax.training.truth import Clips, clips_of, mirrored
 from vggtjax.training.world.pool import PoolClip
 
 GREY = 0.1  # share of clips without colour
+MIRRORED = 0.5  # share of clips of worlds whose left and right are exchanged
 IN_ORDER = 0.5  # share of clips with frames in order of time
 _SUPPRESSION = 1 << 20  # folded into keys: an index beyond those of `split`, so that the clips stay the same
 _REGIONS = 2  # at most, in a clip
@@ -50,7 +51,7 @@ def make_batch(key: Array, textures: Textures, phase: Phase, frames: int, patch_
 
 
 def make_world_batch(key: Array, clips: PoolClip, phase: Phase, frames: int) -> Batch:
-    """Return the batch of clips of worlds, [phase.batch, frames, ...], in random colours.
+    """Return the batch of clips of worlds, [phase.batch, frames, ...], in random colours, half of them mirrored.
 
     In a share `phase.masked_movers` of the clips in which something moves, its keys are suppressed. In clips at rest
     those of random regions are, as in scenes. Pure; `phase` and `frames` are static.
@@ -58,15 +59,22 @@ def make_world_batch(key: Array, clips: PoolClip, phase: Phase, frames: int) -> 
     moving = jnp.asarray(clips.moving)
     moves = moving.any(axis=(1, 2, 3))
 
-    def one(key: Array, images: Array, moving: Array, moves: Array) -> tuple[Array, Array]:
-        _, order_key, colour_key = jax.random.split(key, 3)
+    def one(key: Array, images: Array, moving: Array, moves: Array) -> tuple[Array, Array, Array]:
+        mirror_key, order_key, colour_key = jax.random.split(key, 3)
         masked = moves & (jax.random.uniform(order_key) < phase.masked_movers)
         images = _recolour(colour_key, images.astype(jnp.float32) / 255, phase.gamma)
-        return images, jnp.where(masked, moving, _regions(key, phase, frames) & ~moves)
+        regions = jnp.where(masked, moving, _regions(key, phase, frames) & ~moves)
+        return images, regions, jax.random.uniform(mirror_key) < MIRRORED
 
-    images, regions = jax.vmap(one)(jax.random.split(key, phase.batch), jnp.asarray(clips.images), moving, moves)
+    keys = jax.random.split(key, phase.batch)
+    images, regions, is_mirrored = jax.vmap(one)(keys, jnp.asarray(clips.images), moving, moves)
     truth = clips.camera_from_world, clips.intrinsics, clips.tracks
     seen = Clips(images, *(jnp.asarray(values, jnp.float32) for values in (clips.depth, *truth)))
+    seen, regions = jax.tree.map(
+        lambda a, b: jnp.where(is_mirrored.reshape(-1, *(1,) * (a.ndim - 1)), a, b),
+        (mirrored(seen), regions[..., ::-1]),
+        (seen, regions),
+    )
     return _suppressing(key, phase, Batch(seen, known_cameras=phase.known_cameras == 1), regions)
 
 

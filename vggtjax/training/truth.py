@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -75,6 +76,21 @@ def clips_of(scenes: SyntheticClip, patch_size: int) -> Clips:
     own = jnp.einsum("brpk,brskij->brpsij", one_hot, motion)
     tracks = jnp.einsum("brpsij,brpj->brpsi", own[..., :3], world) + own[..., 3]
     return Clips(scenes.images, scenes.depth, scenes.camera_from_world, scenes.intrinsics, tracks)
+
+
+def mirrored(clips: Clips) -> Clips:
+    """Return clips as a mirror shows them: left and right exchanged, in the pictures and in the world."""
+    (H, W), shape = clips.depth.shape[2:], clips.tracks.shape
+    patch_size = math.isqrt(H * W // shape[2])
+    sign = np.array([-1, 1, 1, 1], np.float32)
+    tracks = clips.tracks.reshape(*shape[:2], H // patch_size, W // patch_size, *shape[3:])[:, :, :, ::-1]
+    return Clips(
+        clips.images[:, :, :, ::-1],
+        clips.depth[:, :, :, ::-1],
+        clips.camera_from_world * np.outer(sign[:3], sign)[None, None],
+        clips.intrinsics.at[..., 0, 2].set(W - clips.intrinsics[..., 0, 2]),
+        tracks.reshape(shape) * sign[(None,) * 4][..., :3],
+    )
 
 
 @full_precision()

@@ -117,7 +117,8 @@ def test_frames_are_taken_in_the_order_that_is_asked_for(clips, folder, tmp_path
 def test_keys_of_what_moves_are_suppressed(clips):
     make = jax.jit(make_world_batch, static_argnums=(2, 3))
     batch = make(jax.random.key(0), clips, PHASE, 3)
-    np.testing.assert_array_equal(batch.regions, clips.moving)
+    for regions, moving in zip(batch.regions, clips.moving, strict=True):
+        assert any(np.array_equal(regions, seen) for seen in (moving, moving[..., ::-1]))
     never = make(jax.random.key(0), clips, dataclasses.replace(PHASE, masked_movers=0.0), 3)
     assert not never.regions.any()
     assert batch.clips.images.min() >= 0
