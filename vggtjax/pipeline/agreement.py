@@ -35,8 +35,8 @@ def agree_with_pixels(
 ) -> AnyResult:
     """Return the result with refined cameras and consistent depth, if the options say so.
 
-    Consistent depth starts from refined cameras, and takes their points, if both are wanted. A mask that was mined by
-    matches is mined by pixels after it.
+    Consistent depth starts from refined cameras, and takes their points, if both are wanted. A mined mask is mined by
+    pixels after it.
 
     Args:
         result: of the passes.
@@ -57,9 +57,8 @@ def agree_with_pixels(
             priors = dataclasses.replace(priors, focal=None)
         with on_stage("consistent depth") as progress:
             points = None if refined is None else refined.points
-            result, report = consistent_depth(result, pictures(), points=points, priors=priors, progress=progress)
-        if report.changed and result.motion is not None:  # pixels match better than the network
-            with on_stage("mask by pixels"):
-                result = mask_by_pixels(result, pictures())
+            result, _ = consistent_depth(result, pictures(), points=points, priors=priors, progress=progress)
+        with on_stage("mask by pixels"):  # they match better than the network, also around cameras that stayed
+            result = mask_by_pixels(result, pictures(), smooth_frames=options.smooth_frames)
         result = dataclasses.replace(result, settings=result.settings | {"consistent_depth": True})
     return result

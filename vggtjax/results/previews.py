@@ -18,7 +18,7 @@ from vggtjax.storage.arrays import spread_frames
 
 DEPTH_COLORS = color_ramp("turbo")  # far cold, near warm
 SALIENCY_COLORS = color_ramp("inferno")
-MOST_MOTION = 5  # times the median: the brightest motion by matches
+MOST_MOTION = 5  # times the median: the brightest motion
 CONFIDENCE_COLORS = color_ramp("viridis")  # unsure dark, sure bright
 _NO_DEPTH = np.array([40, 40, 46], np.uint8)
 # Of objects by id: hues spaced by the golden ratio; black for no object.
@@ -172,7 +172,7 @@ def _rows(result: Result, shown: Int[np.ndarray, " F"], size: tuple[int, int]) -
     if result.motion is not None:
         above = (result.motion[shown] - 1) / (MOST_MOTION - 1)
         ramp = (SALIENCY_COLORS, "median", f"{MOST_MOTION} x")
-        rows.append(Row("By matches", [_heat(x, size) for x in above], ramp=ramp))
+        rows.append(Row("Motion", [_heat(x, size) for x in above], ramp=ramp))
     if result.has_mask:
         objects = int(result.instances.max())
         notes = f"{result.dynamic_share:.1%} of pixels\n{objects} object{'' if objects == 1 else 's'}"

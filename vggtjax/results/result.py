@@ -62,7 +62,7 @@ class Result:
     track_visibility: Float32[np.ndarray, "S Q"] | None = None  # probabilities
     track_confidence: Float32[np.ndarray, "S Q"] | None = None
     track_frames: Int64[np.ndarray, " Q"] | None = None  # of the queries
-    motion: Float32[np.ndarray, "S h w"] | None = None  # of each patch, by matches, over the clip's median
+    motion: Float32[np.ndarray, "S h w"] | None = None  # of each patch, by matches or pixels, over the median
     passes: Any = None  # outputs of the network; in memory only, never saved
 
     def __post_init__(self) -> None:
@@ -287,8 +287,16 @@ def missing_fields(result: Result) -> tuple[str, ...]:
 
 def makes_no_mask(result: Result) -> bool:
     """Return whether a method of ours made the result and makes no mask, and none was given."""
-    is_made_up = str(result.settings.get("masks")).startswith(("mined", "none"))
-    return is_made_up and result.method in METHODS and not METHODS[result.method].needs_second_pass
+    return _masks_are_ours(result) and result.method in METHODS and not METHODS[result.method].needs_second_pass
+
+
+def mines_mask(result: Result) -> bool:
+    """Return whether the mask of the result was mined by a method of ours."""
+    return _masks_are_ours(result) and result.method in METHODS and METHODS[result.method].needs_second_pass
+
+
+def _masks_are_ours(result: Result) -> bool:
+    return str(result.settings.get("masks")).startswith(("mined", "none"))
 
 
 def without_mask(result: AnyResult) -> AnyResult:

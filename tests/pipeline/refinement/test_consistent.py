@@ -163,10 +163,13 @@ def room():
     pictures, result = paint(corner), corner_result(corner, degrees=0, share=0)
     images = pictures[:, 1::SCALE, 1::SCALE]
     saliency = np.full((len(pictures), 6, 8), 0.3, np.float32)
-    return pictures, dataclasses.replace(result, images=images, saliency=saliency, motion=np.ones_like(saliency))
+    settings = result.settings | {"masks": "mined"}
+    fields = {"images": images, "saliency": saliency, "motion": np.ones_like(saliency), "settings": settings}
+    return pictures, dataclasses.replace(result, method="4dvggt-d", **fields)
 
 
-def test_what_moves_is_found(room):
+@pytest.mark.parametrize("has_matches", [True, False])
+def test_what_moves_is_found(room, has_matches):
     pictures, result = room
     moved, mask = pictures.copy(), np.zeros(pictures.shape[:3], bool)
     poster = np.random.default_rng(5).integers(0, 255, (8, 8, 1), np.uint8).repeat(6, 0).repeat(6, 1).repeat(3, 2)
@@ -175,6 +178,7 @@ def test_what_moves_is_found(room):
         moved[place], mask[place] = poster, True
     mask = mask[:, 1::SCALE, 1::SCALE]
     motion = 1 + mask.reshape(len(mask), 6, 8, 8, 8).mean(axis=(2, 4), dtype=np.float32)  # too little to tell alone
+    motion = motion if has_matches else None
     predicted = dataclasses.replace(result, images=moved[:, 1::SCALE, 1::SCALE], motion=motion)
     assert mask_by_pixels(predicted, iter(pictures)).dynamic_mask.mean() < 0.03
     made = mask_by_pixels(predicted, iter(moved))
@@ -185,8 +189,10 @@ def test_what_moves_is_found(room):
     np.testing.assert_array_equal(made.depth, result.depth)
 
 
-def test_nothing_is_found_where_nothing_moves(room):
+@pytest.mark.parametrize("has_matches", [True, False])
+def test_nothing_is_found_where_nothing_moves(room, has_matches):
     pictures, result = room
+    result = result if has_matches else dataclasses.replace(result, motion=None)
     assert mask_by_pixels(result, iter(pictures)).dynamic_mask.mean() < 0.03
 
 
@@ -200,8 +206,17 @@ def test_the_network_has_a_say(room, name):
     assert (ratio[:, 1, 1] > 1.2 * ratio[:, 4, 6]).all()
 
 
+def test_motion_is_averaged_over_frames(room):
+    pictures, result = room
+    plain, smooth = (mask_by_pixels(result, iter(pictures), smooth_frames=count).motion for count in (1, 3))
+    middle = plain[:3].mean(axis=0)
+    np.testing.assert_allclose(smooth[1] / smooth[1].mean(), middle / middle.mean(), rtol=1e-4)
+
+
 def test_two_frames_equal_frames_and_masks_of_other_sources_stay(room):
     pictures, result = room
     equal = dataclasses.replace(result, images=np.repeat(result.images[:1], len(result.images), axis=0))
-    for each in (first_frames(result, 2), equal, dataclasses.replace(result, motion=None)):
+    given = dataclasses.replace(result, settings=result.settings | {"masks": "given"})
+    plain = dataclasses.replace(result, method="vggt", motion=None)
+    for each in (first_frames(result, 2), equal, dataclasses.replace(result, saliency=None, motion=None), given, plain):
         assert mask_by_pixels(each, iter(pictures)) is each

@@ -16,7 +16,7 @@ from vggtjax.method.matching.matched_motion import FEWEST_FRAMES, motion
 from vggtjax.method.matching.matches import Matches
 from vggtjax.network.heads.pose import decode_pose
 
-_TIMES_MEDIAN = 2.5  # Otsu's threshold alone would find something in static clips
+TIMES_MEDIAN = 2.5  # Otsu's threshold alone would find something in static clips
 
 
 class MotionMask(NamedTuple):
@@ -65,6 +65,6 @@ def motion_pixels(motion: Float[Array, "B S h w"], images: Float[Array, "B S H W
     return follow_edges(upsample(motion, (H, W)), images, H // motion.shape[2])
 
 
-def is_moving(pixels: Float[Array, "S H W"]) -> Bool[Array, "S H W"]:
-    """Return where the motion of a clip's pixels is above Otsu's threshold, and above 2.5 times its median."""
-    return pixels >= jnp.maximum(otsu_threshold(pixels), _TIMES_MEDIAN * jnp.median(pixels))
+def is_moving(pixels: Float[Array, "S H W"], times_median: float = TIMES_MEDIAN) -> Bool[Array, "S H W"]:
+    """Return where the motion of a clip's pixels is above Otsu's threshold, and above so many times its median."""
+    return pixels >= jnp.maximum(otsu_threshold(pixels), times_median * jnp.median(pixels))

@@ -11,14 +11,15 @@ import numpy as np
 from jaxtyping import Array, Float, Float32, UInt8
 from PIL import Image
 
-from vggtjax.method.matching.matched_mask import is_moving, motion_pixels
+from vggtjax.method.mask import smooth_over_time
+from vggtjax.method.matching.matched_mask import TIMES_MEDIAN, is_moving, motion_pixels
 from vggtjax.method.matching.matched_motion import VOTE, voted
 from vggtjax.method.matching.matches import frame_pairs
 from vggtjax.network.surroundings import own_settings
 from vggtjax.pipeline.refinement.cells import Cells, at_scale, cells_of, grey_pictures
 from vggtjax.pipeline.refinement.consistent import FEWEST_FRAMES, MOST_FRAMES
 from vggtjax.pipeline.refinement.pixel_matches import PixelMatches, Window, expected_matches, match_pixels
-from vggtjax.results.result import AnyResult
+from vggtjax.results.result import AnyResult, mines_mask
 
 _mask = jax.jit(is_moving)
 
@@ -30,30 +31,36 @@ _SURE = 0.1  # weight from which a match tells the scale
 _LEAST_MOTION = 1e-3  # by matches
 _LEAST = 0.2  # sum of the weights of a cell's matches, from which they tell its motion
 _OFFSET, _FLOOR = 0.25, 0.1  # score = log(difference + offset) + log(Gram + floor)
+_TIMES_MEDIAN = 4.0  # least motion without matches of the network; the score is then twice as wide
 
 
 @own_settings()
-def mask_by_pixels(result: AnyResult, pictures: Iterable[UInt8[np.ndarray, "h w 3"]] | None = None) -> AnyResult:
+def mask_by_pixels(
+    result: AnyResult, pictures: Iterable[UInt8[np.ndarray, "h w 3"]] | None = None, *, smooth_frames: int = 1
+) -> AnyResult:
     """Return the result with the motion and the dynamic mask that its pixels tell, around its cameras and depth.
 
-    Stays as it is: a clip of fewer than three frames or more than 512, or of equal frames, or whose mask was not mined
-    by matches.
+    Stays as it is: a clip of fewer than three frames or more than 512, or of equal frames, or whose mask was not mined.
 
     Args:
-        result: cameras and depth that agree with the pixels, with the Gram saliency and the motion by matches.
+        result: cameras and depth that agree with the pixels, with the Gram saliency; the motion by matches is read
+            where there is one.
         pictures: of the source, in the order of the frames; the result's own images if None.
+        smooth_frames: odd number of frames over which the motion is averaged (`smooth_over_time`).
 
     Raises ClipError for pictures that are missing, or of another size than the result's.
     """
-    if not FEWEST_FRAMES <= len(result.depth) <= MOST_FRAMES or result.saliency is None or result.motion is None:
+    if not FEWEST_FRAMES <= len(result.depth) <= MOST_FRAMES or result.saliency is None or not mines_mask(result):
         return result
     if all((image == result.images[0]).all() for image in result.images):
         return result
     cells = cells_of(result)
     grey = grey_pictures(result, pictures, cells.grid)
     motion = pixel_motion(cells, grey, result.saliency, result.motion)
+    motion = np.asarray(smooth_over_time(jnp.asarray(motion[None]), smooth_frames))[0]
     pixels = np.stack([_pixels(*each) for each in zip(motion, result.images, strict=True)])
-    mask = np.asarray(_mask(pixels)) & result.inside_pictures & (result.depth != 0)
+    times_median = _TIMES_MEDIAN if result.motion is None else TIMES_MEDIAN
+    mask = np.asarray(_mask(pixels, times_median)) & result.inside_pictures & (result.depth != 0)
     settings = result.settings | {"masks": SOURCE}
     return dataclasses.replace(result, motion=motion / np.median(motion), dynamic_mask=mask, settings=settings)
 
@@ -62,9 +69,9 @@ def pixel_motion(
     cells: Cells,
     grey: UInt8[np.ndarray, "S H W"],
     saliency: Float32[np.ndarray, "S h w"],
-    motion: Float32[np.ndarray, "S h w"],
+    motion: Float32[np.ndarray, "S h w"] | None,
 ) -> Float32[np.ndarray, "S h w"]:
-    """Return the motion of every patch, positive: the geometric mean of what pixels and the network's matches say.
+    """Return the motion of every patch, positive: what pixels say, or its geometric mean with what matches say.
 
     Pixels say how far they match from where a static world shows them, times the Gram saliency.
 
@@ -72,14 +79,16 @@ def pixel_motion(
         cells: of a static world.
         grey: pictures, with 12 pixels a cell.
         saliency: the Gram saliency of every patch, in [0, 1].
-        motion: of every patch by the network's matches, over the clip's median.
+        motion: of every patch by the network's matches, over the clip's median; None without them.
     """
     S, (h, w), grid = len(grey), saliency.shape[1:], cells.grid
     expected, warp = expected_matches(cells.depth, cells.cameras, grid)
     found = match_pixels(at_scale(grey, grid, _PIXELS), expected, warp, grid, _WINDOW)
-    gram, matched = (_resized(each, grid, Image.Resampling.BILINEAR).reshape(S, -1) for each in (saliency, motion))
+    gram = _resized(saliency, grid, Image.Resampling.BILINEAR).reshape(S, -1)
     score = np.log(_difference(expected, found) + _OFFSET) + np.log(gram.clip(0, 1) + _FLOOR)
-    score = (score - np.median(score) + np.log(np.maximum(matched, _LEAST_MOTION))) / 2
+    if motion is not None:
+        matched = _resized(motion, grid, Image.Resampling.BILINEAR).reshape(S, -1)
+        score = (score - np.median(score) + np.log(np.maximum(matched, _LEAST_MOTION))) / 2
     score = np.asarray(voted(score, found.position, VOTE * found.weight, frame_pairs(S), grid))  # type: ignore[arg-type]
     return _resized(np.exp(score).reshape(S, *grid), (h, w), Image.Resampling.BOX)
 

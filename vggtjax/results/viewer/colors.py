@@ -176,7 +176,7 @@ _MODES = (
     ),
     ColorMode("saliency", lambda result: result.saliency is not None, _saliency, SALIENCY_COLORS, _ends("0", "1")),
     ColorMode(
-        "motion by matches",
+        "motion",
         lambda result: result.motion is not None,
         _motion,
         SALIENCY_COLORS,
