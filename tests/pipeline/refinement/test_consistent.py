@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from scipy.ndimage import zoom
+from skimage.measure import label
 
 from tests.shared.corner import HEIGHT, SCALE, WIDTH, corner_result, make_corner, paint
 from vggtjax.errors import ClipError
@@ -183,6 +184,8 @@ def test_what_moves_is_found(room, has_matches):
     assert mask_by_pixels(predicted, iter(pictures)).dynamic_mask.mean() < 0.03
     made = mask_by_pixels(predicted, iter(moved))
     assert (made.dynamic_mask & mask).sum() > 0.6 * (made.dynamic_mask | mask).sum()
+    for side in (made.dynamic_mask, ~made.dynamic_mask):  # no region and no hole is smaller than a quarter of a patch
+        assert min(np.bincount(np.asarray(label(frame)).ravel())[1:].min() for frame in side) > 64 / 4
     assert made.motion.shape == result.saliency.shape
     assert np.median(made.motion) == pytest.approx(1, rel=1e-5)
     assert made.settings["masks"] == SOURCE

@@ -8,8 +8,9 @@ from collections.abc import Iterable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Float32, UInt8
+from jaxtyping import Array, Bool, Float, Float32, UInt8
 from PIL import Image
+from skimage.morphology import remove_small_holes, remove_small_objects
 
 from vggtjax.method.mask import smooth_over_time
 from vggtjax.method.matching.matched_mask import TIMES_MEDIAN, is_moving, motion_pixels
@@ -30,6 +31,7 @@ _LARGEST = 8.0  # differences beyond this many scales count as this
 _SURE = 0.1  # weight from which a match tells the scale
 _LEAST_MOTION = 1e-3  # by matches
 _LEAST = 0.2  # sum of the weights of a cell's matches, from which they tell its motion
+_SPECK = 0.25  # of a patch's pixels: smaller regions and holes of the mask are noise
 _OFFSET, _FLOOR = 0.25, 0.1  # score = log(difference + offset) + log(Gram + floor)
 _TIMES_MEDIAN = 4.0  # least motion without matches of the network; the score is then twice as wide
 
@@ -60,7 +62,9 @@ def mask_by_pixels(
     motion = np.asarray(smooth_over_time(jnp.asarray(motion[None]), smooth_frames))[0]
     pixels = np.stack([_pixels(*each) for each in zip(motion, result.images, strict=True)])
     times_median = _TIMES_MEDIAN if result.motion is None else TIMES_MEDIAN
-    mask = np.asarray(_mask(pixels, times_median)) & result.inside_pictures & (result.depth != 0)
+    mask = np.asarray(_mask(pixels, times_median))
+    mask = np.stack([_without_specks(frame, result.saliency[0].size) for frame in mask])
+    mask &= result.inside_pictures & (result.depth != 0)
     settings = result.settings | {"masks": SOURCE}
     return dataclasses.replace(result, motion=motion / np.median(motion), dynamic_mask=mask, settings=settings)
 
@@ -101,6 +105,12 @@ def _difference(expected: Float32[np.ndarray, "S M P 2"], found: PixelMatches) -
     total = weight.sum(axis=1)
     mean = np.sum(weight * np.minimum(distance / scale, _LARGEST), axis=1) / np.maximum(total, _LEAST)
     return np.where(total > _LEAST, mean, np.median(mean))
+
+
+def _without_specks(mask: Bool[np.ndarray, "H W"], patches: int) -> Bool[np.ndarray, "H W"]:
+    """Return a mask without regions and holes smaller than a quarter of a patch, of which no patch tells anything."""
+    most = int(_SPECK * mask.size / patches)
+    return remove_small_holes(remove_small_objects(mask, max_size=most), max_size=most)
 
 
 @jax.jit
