@@ -13,7 +13,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.shared.da3 import TINY
 from tests.shared.training_runs import RECIPE
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
@@ -72,13 +71,6 @@ def test_other_numbers_of_steps_keep_the_shares(steps):
 def test_bad_recipes_are_named(text, says):
     with pytest.raises(InputError, match=says):
         Recipe.from_json(text)
-
-
-def test_the_camera_encoder_learns_only_where_it_is_read():
-    recipe = dataclasses.replace(RECIPE, model=TINY, untrained=(), losses=LossWeights(points=0))
-    stages = tuple(dataclasses.replace(stage, known_cameras=0.3) for stage in recipe.stages)
-    assert recipe.frozen == ("camera_encoder",)
-    assert dataclasses.replace(recipe, stages=stages).frozen == ()
 
 
 DOCS = Path(__file__).parents[2] / "docs"

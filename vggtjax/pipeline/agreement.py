@@ -11,7 +11,7 @@ from jaxtyping import UInt8
 from vggtjax.options import Options
 from vggtjax.pipeline.refinement.consistent import consistent_depth
 from vggtjax.pipeline.refinement.dense import KNOWN, PREDICTED
-from vggtjax.pipeline.refinement.pixel_mask import mask_by_pixels
+from vggtjax.pipeline.refinement.pixel_mask import mask_by_pixels, takes_pixel_mask
 from vggtjax.pipeline.refinement.refine import refine_with_points, warn_of_kept
 from vggtjax.progress import OnStage, no_stage
 from vggtjax.results.result import AnyResult
@@ -35,8 +35,8 @@ def agree_with_pixels(
 ) -> AnyResult:
     """Return the result with refined cameras and consistent depth, if the options say so.
 
-    Consistent depth starts from refined cameras, and takes their points, if both are wanted. A mined mask is mined by
-    pixels after it.
+    Consistent depth starts from refined cameras, and takes their points, if both are wanted. A mined mask that is not
+    refined is mined by pixels after it.
 
     Args:
         result: of the passes.
@@ -58,7 +58,8 @@ def agree_with_pixels(
         with on_stage("consistent depth") as progress:
             points = None if refined is None else refined.points
             result, _ = consistent_depth(result, pictures(), points=points, priors=priors, progress=progress)
-        with on_stage("mask by pixels"):  # they match better than the network, also around cameras that stayed
-            result = mask_by_pixels(result, pictures(), smooth_frames=options.smooth_frames)
+        if takes_pixel_mask(result):  # pixels match better than the network, also around cameras that stayed
+            with on_stage("mask by pixels"):
+                result = mask_by_pixels(result, pictures())
         result = dataclasses.replace(result, settings=result.settings | {"consistent_depth": True})
     return result

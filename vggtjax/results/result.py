@@ -290,9 +290,9 @@ def makes_no_mask(result: Result) -> bool:
     return _masks_are_ours(result) and result.method in METHODS and not METHODS[result.method].needs_second_pass
 
 
-def mines_mask(result: Result) -> bool:
-    """Return whether the mask of the result was mined by a method of ours."""
-    return _masks_are_ours(result) and result.method in METHODS and METHODS[result.method].needs_second_pass
+def mask_is_mined(result: Result) -> bool:
+    """Return whether a method of ours mined the mask of the result, in some of its windows at least."""
+    return _masks_are_ours(result) and "mined" in str(result.settings.get("masks")) and not makes_no_mask(result)
 
 
 def _masks_are_ours(result: Result) -> bool:

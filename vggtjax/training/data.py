@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -46,8 +44,8 @@ def make_batch(key: Array, textures: Textures, phase: Phase, frames: int, patch_
         return clip, _regions(key, phase, frames)[order] if drawn else None
 
     scenes, regions = jax.vmap(one)(jax.random.split(key, phase.batch))
-    batch = Batch(clips_of(scenes, patch_size), known_cameras=phase.known_cameras == 1)
-    return batch if regions is None else _suppressing(key, phase, batch, regions)
+    clips = clips_of(scenes, patch_size)
+    return Batch(clips) if regions is None else _suppressing(key, phase, clips, regions)
 
 
 def make_world_batch(key: Array, clips: PoolClip, phase: Phase, frames: int) -> Batch:
@@ -75,7 +73,7 @@ def make_world_batch(key: Array, clips: PoolClip, phase: Phase, frames: int) -> 
         (mirrored(seen), regions[..., ::-1]),
         (seen, regions),
     )
-    return _suppressing(key, phase, Batch(seen, known_cameras=phase.known_cameras == 1), regions)
+    return _suppressing(key, phase, seen, regions)
 
 
 def _regions(key: Array, phase: Phase, frames: int) -> Bool[Array, "S H W"]:
@@ -85,11 +83,10 @@ def _regions(key: Array, phase: Phase, frames: int) -> Bool[Array, "S H W"]:
     return regions & (jax.random.uniform(coin_key) < phase.suppressed)
 
 
-def _suppressing(key: Array, phase: Phase, batch: Batch, regions: Bool[Array, "B S H W"]) -> Batch:
+def _suppressing(key: Array, phase: Phase, clips: Clips, regions: Bool[Array, "B S H W"]) -> Batch:
     low, high = phase.suppressed_pairs
     pairs = high - (high - low) * jax.random.uniform(jax.random.fold_in(key, _SUPPRESSION))
-    pairs = jnp.broadcast_to(pairs, (phase.batch,))
-    return dataclasses.replace(batch, regions=regions, pairs=pairs, suppress=phase.suppress)
+    return Batch(clips, regions, jnp.broadcast_to(pairs, (phase.batch,)), phase.suppress)
 
 
 def _recolour(key: Array, images: Array, width: float) -> Array:

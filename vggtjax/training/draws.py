@@ -17,7 +17,7 @@ from vggtjax.training.world.pool import ClipPool, Job, PoolClip
 _FIRST = 16  # clips of each size in the pool of the first step
 _WINDOW = 256  # of the newest clips of a size the clips of a step are drawn
 _AHEAD = 24  # steps whose clips are rendered before they come
-_STREAM = 1  # of the draws of clips, beside those of sizes
+_STREAM, _CAMERAS = 1, 2  # of the draws of clips and of known cameras, beside those of sizes
 
 
 logger = logging.getLogger(__name__)
@@ -32,16 +32,20 @@ class Draw(NamedTuple):
 
 
 def draw_shape(recipe: Recipe, step: int) -> tuple[int, Phase, int]:
-    """Return the index of a step's phase, the phase as the step has it, and one of its numbers of frames.
+    """Return the index of a step's phase, the phase with one of its sizes, and one of its numbers of frames.
 
-    A step has one of the phase's sizes, and known cameras or none. The draw depends on the data seed and the step
-    alone.
+    The draw depends on the data seed and the step alone.
     """
     index, phase = recipe.phase_at(step)
     generator = np.random.default_rng((recipe.data_seed, step))
     frames = int(generator.choice(phase.frames))
-    phase = phase.of_size(int(generator.integers(len(phase.all_sizes))))
-    return index, phase.with_cameras(known=generator.random() < phase.known_cameras), frames
+    return index, phase.of_size(int(generator.integers(len(phase.all_sizes)))), frames
+
+
+def draws_cameras(recipe: Recipe, step: int) -> bool:
+    """Return whether the network reads the true cameras in a step, by the data seed and the step alone."""
+    generator = np.random.default_rng((recipe.data_seed, step, _CAMERAS))
+    return generator.random() < recipe.phase_at(step)[1].known_cameras
 
 
 class Worlds:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import math
 import signal
@@ -21,7 +22,7 @@ from vggtjax.network.layers import Params
 from vggtjax.storage.writing import locked_folder
 from vggtjax.training.data import make_batch as make_scene_batch
 from vggtjax.training.data import make_world_batch
-from vggtjax.training.draws import Worlds, draw_shape, opened_worlds
+from vggtjax.training.draws import Worlds, draw_shape, draws_cameras, opened_worlds
 from vggtjax.training.metrics import Row
 from vggtjax.training.objective import init_probes as init_scene_probes
 from vggtjax.training.objective import objective as scene_objective
@@ -158,7 +159,7 @@ class _Trainer:
         self._make_world_batch = jax.jit(task.make_world_batch, static_argnums=(2, 3), out_shardings=where.by_clip)
         self._worlds = worlds
         self._key = jax.random.key(run.recipe.data_seed)
-        self._compiled: set[tuple[Phase, int]] = set()
+        self._compiled: set[tuple[Phase, int, bool]] = set()
         self._ahead: deque[Metrics] = deque()
         self.timed = 0  # steps timed since the last row of metrics
 
@@ -166,7 +167,8 @@ class _Trainer:
         """Do one step of the run."""
         run, recipe = self._run, self._run.recipe
         index, phase, frames = draw_shape(recipe, run.step)
-        is_timed = self.timed < _TIMED and (phase, frames) in self._compiled
+        program = phase, frames, draws_cameras(recipe, run.step)
+        is_timed = self.timed < _TIMED and program in self._compiled
         wait = jax.block_until_ready if is_timed else lambda tree: tree
         wait(run.state)
         began = time.perf_counter()
@@ -176,6 +178,8 @@ class _Trainer:
             batch = self._make_batch(key, self._textures, phase, frames, recipe.model.patch_size)
         else:
             batch = self._make_world_batch(key, clips, phase, frames)
+        if program[-1]:
+            batch = dataclasses.replace(batch, known_cameras=True)
         wait(batch)
         rendered = time.perf_counter()
         metrics, gradient = _loss_and_gradient(run.state.trained, batch, recipe, self._objective)
@@ -183,7 +187,7 @@ class _Trainer:
         if is_timed:
             run.averages.add({"render_share": (rendered - began) / (time.perf_counter() - began)})
             self.timed += 1
-        self._compiled.add((phase, frames))
+        self._compiled.add(program)
         run.advance(index, phase, metrics)
         self._ahead.append(metrics)
         if len(self._ahead) > _AHEAD:

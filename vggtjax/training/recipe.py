@@ -89,10 +89,6 @@ class Phase:
         height, width = self.all_sizes[index]
         return dataclasses.replace(self, height=height, width=width, sizes=()) if self.sizes else self
 
-    def with_cameras(self, *, known: bool) -> Phase:
-        """Return the phase with known cameras in all steps or in none."""
-        return dataclasses.replace(self, known_cameras=float(known)) if 0 < self.known_cameras < 1 else self
-
     def scenes(self, frames: int) -> SceneConfig:
         """Return the configuration of scenes of `frames` frames. Raises InputError for invalid values."""
         same = ("boxes", "ellipsoids", "cylinders", "motion", "pitch", "roll", "field_of_view")
@@ -185,7 +181,7 @@ class Recipe:
                 )
         if not self.assets and any(phase.worlds for phase in self.stages):
             raise InputError("a phase has worlds and recipe.assets is empty; expected the folder of their assets")
-        if self.reads_cameras and not self.model.reads_cameras:
+        if not self.model.reads_cameras and any(phase.known_cameras for phase in self.stages):
             raise InputError(
                 f"a phase has known_cameras and the model, of family {self.model.family} with camera_depth "
                 f"{self.model.camera_depth}, does not read any; leave known_cameras out"
@@ -221,15 +217,8 @@ class Recipe:
     def frozen(self) -> tuple[str, ...]:
         """Modules of the model that stay unchanged."""
         absent = {module for name, module in HEADS.items() if name not in self.model.heads}
-        untrained = [name for name in self.untrained if name not in absent]
-        if self.model.reads_cameras and not self.reads_cameras:
-            untrained.append("camera_encoder")
+        untrained = (name for name in self.untrained if name not in absent)
         return (*(("backbone", "aggregator") if self.trainable == "heads" else ()), *untrained)
-
-    @property
-    def reads_cameras(self) -> bool:
-        """Whether the network reads true cameras in some steps."""
-        return any(phase.known_cameras for phase in self.stages)
 
     @property
     def total_steps(self) -> int:

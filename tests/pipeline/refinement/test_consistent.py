@@ -9,12 +9,18 @@ from skimage.measure import label
 
 from tests.shared.corner import HEIGHT, SCALE, WIDTH, corner_result, make_corner, paint
 from vggtjax.errors import ClipError
+from vggtjax.options import Options
+from vggtjax.pipeline import agreement
+from vggtjax.pipeline.agreement import agree_with_pixels
 from vggtjax.pipeline.refinement import consistent
-from vggtjax.pipeline.refinement.consistent import consistent_depth
+from vggtjax.pipeline.refinement.consistent import ConsistencyReport, consistent_depth
 from vggtjax.pipeline.refinement.dense import KNOWN
 from vggtjax.pipeline.refinement.pixel_mask import SOURCE, mask_by_pixels
+from vggtjax.progress import StageSeconds
 from vggtjax.research.evaluation.metrics.depth import depth_errors
 from vggtjax.research.evaluation.metrics.trajectory import rotation_error
+
+CONSISTENT = Options(consistent_depth=True)
 
 
 @pytest.fixture(scope="module")
@@ -211,15 +217,58 @@ def test_the_network_has_a_say(room, name):
 
 def test_motion_is_averaged_over_frames(room):
     pictures, result = room
-    plain, smooth = (mask_by_pixels(result, iter(pictures), smooth_frames=count).motion for count in (1, 3))
+    both = (dataclasses.replace(result, settings=result.settings | {"smooth_frames": count}) for count in (1, 3))
+    plain, smooth = (mask_by_pixels(each, iter(pictures)).motion for each in both)
     middle = plain[:3].mean(axis=0)
     np.testing.assert_allclose(smooth[1] / smooth[1].mean(), middle / middle.mean(), rtol=1e-4)
 
 
-def test_two_frames_equal_frames_and_masks_of_other_sources_stay(room):
+def stays(result, *_, **__):
+    return result, ConsistencyReport(False)
+
+
+def test_two_frames_equal_frames_and_masks_of_other_sources_stay(room, monkeypatch):
+    monkeypatch.setattr(agreement, "consistent_depth", stays)
     pictures, result = room
     equal = dataclasses.replace(result, images=np.repeat(result.images[:1], len(result.images), axis=0))
     given = dataclasses.replace(result, settings=result.settings | {"masks": "given"})
     plain = dataclasses.replace(result, method="vggt", motion=None)
-    for each in (first_frames(result, 2), equal, dataclasses.replace(result, saliency=None, motion=None), given, plain):
+    refined = dataclasses.replace(result, settings=result.settings | {"refine_mask": True})
+    unseen = dataclasses.replace(result, saliency=None, motion=None)
+    for each in (first_frames(result, 2), equal, unseen, given, plain, refined):
         assert mask_by_pixels(each, iter(pictures)) is each
+        stages = StageSeconds()
+        made = agree_with_pixels(each, lambda: pictures, CONSISTENT, on_stage=stages.stage)
+        assert "mask by pixels" not in stages.seconds
+        np.testing.assert_array_equal(made.dynamic_mask, each.dynamic_mask)
+
+
+def test_pictures_without_matches_leave_the_mask(room):
+    pictures, result = room
+    assert mask_by_pixels(result, iter(np.full_like(pictures, 90))) is result
+
+
+@pytest.mark.parametrize("changed", [True, False])
+def test_masks_by_cues_are_mined_by_pixels_also_where_depth_stays(room, monkeypatch, changed):
+    pictures, result = room
+    result = dataclasses.replace(result, motion=None, dynamic_mask=np.ones_like(result.dynamic_mask))
+    if not changed:
+        monkeypatch.setattr(agreement, "consistent_depth", stays)
+    stages = StageSeconds()
+    made = agree_with_pixels(result, lambda: pictures, CONSISTENT, on_stage=stages.stage)
+    assert "mask by pixels" in stages.seconds
+    assert made.settings["masks"] == SOURCE
+    assert made.motion is not None
+    assert made.dynamic_mask.mean() < 0.05
+
+
+def test_padding_says_nothing_of_the_threshold(room):
+    """Half of the picture is padding: what is dynamic stays about the same in the other half."""
+    pictures, result = room
+    H, W = result.depth.shape[1:]
+    box = np.tile(np.array([0, 0, W // 2, H]), (len(result.depth), 1))
+    padded = dataclasses.replace(result, motion=None, valid_box=box)
+    made = mask_by_pixels(padded, iter(pictures))
+    assert made.dynamic_mask.mean() < 0.03
+    assert not made.dynamic_mask[:, :, W // 2 :].any()
+    assert np.median(made.motion[:, :, : made.motion.shape[2] // 2]) == pytest.approx(1, rel=1e-5)

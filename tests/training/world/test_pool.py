@@ -116,13 +116,20 @@ def test_frames_are_taken_in_the_order_that_is_asked_for(clips, folder, tmp_path
 
 def test_keys_of_what_moves_are_suppressed(clips):
     make = jax.jit(make_world_batch, static_argnums=(2, 3))
-    batch = make(jax.random.key(0), clips, PHASE, 3)
-    for regions, moving in zip(batch.regions, clips.moving, strict=True):
-        assert any(np.array_equal(regions, seen) for seen in (moving, moving[..., ::-1]))
+    seen = [make(jax.random.key(number), clips, PHASE, 3) for number in range(4)]
+    turns = set()
+    for batch in seen:
+        for number, of_clip in enumerate(zip(batch.regions, batch.clips.depth, batch.clips.tracks, strict=True)):
+            turn = 1 if np.array_equal(of_clip[1], np.float32(clips.depth[number])) else -1
+            turns.add(turn)
+            np.testing.assert_array_equal(of_clip[0], clips.moving[number][..., ::turn])
+            np.testing.assert_array_equal(of_clip[1], np.float32(clips.depth[number])[..., ::turn])
+            np.testing.assert_array_equal(np.unique(of_clip[2][..., 0]), np.unique(turn * clips.tracks[number][..., 0]))
+    assert turns == {1, -1}
     never = make(jax.random.key(0), clips, dataclasses.replace(PHASE, masked_movers=0.0), 3)
     assert not never.regions.any()
-    assert batch.clips.images.min() >= 0
-    assert batch.clips.images.max() <= 1
+    assert seen[0].clips.images.min() >= 0
+    assert seen[0].clips.images.max() <= 1
 
 
 def test_a_set_of_worlds_is_read_by_evaluate(folder, tmp_path):

@@ -65,6 +65,6 @@ def motion_pixels(motion: Float[Array, "B S h w"], images: Float[Array, "B S H W
     return follow_edges(upsample(motion, (H, W)), images, H // motion.shape[2])
 
 
-def is_moving(pixels: Float[Array, "S H W"], times_median: float = TIMES_MEDIAN) -> Bool[Array, "S H W"]:
-    """Return where the motion of a clip's pixels is above Otsu's threshold, and above so many times its median."""
-    return pixels >= jnp.maximum(otsu_threshold(pixels), times_median * jnp.median(pixels))
+def is_moving(pixels: Float[Array, "S H W"]) -> Bool[Array, "S H W"]:
+    """Return where the motion of a clip's pixels is above Otsu's threshold, and above 2.5 times its median."""
+    return pixels >= jnp.maximum(otsu_threshold(pixels), TIMES_MEDIAN * jnp.median(pixels))

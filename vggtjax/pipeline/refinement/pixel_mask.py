@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterable
 
 import jax
@@ -10,19 +11,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float32, UInt8
 from PIL import Image
+from skimage.filters import threshold_otsu
 from skimage.morphology import remove_small_holes, remove_small_objects
 
 from vggtjax.method.mask import smooth_over_time
-from vggtjax.method.matching.matched_mask import TIMES_MEDIAN, is_moving, motion_pixels
+from vggtjax.method.matching.matched_mask import TIMES_MEDIAN, motion_pixels
 from vggtjax.method.matching.matched_motion import VOTE, voted
 from vggtjax.method.matching.matches import frame_pairs
 from vggtjax.network.surroundings import own_settings
 from vggtjax.pipeline.refinement.cells import Cells, at_scale, cells_of, grey_pictures
 from vggtjax.pipeline.refinement.consistent import FEWEST_FRAMES, MOST_FRAMES
 from vggtjax.pipeline.refinement.pixel_matches import PixelMatches, Window, expected_matches, match_pixels
-from vggtjax.results.result import AnyResult, mines_mask
-
-_mask = jax.jit(is_moving)
+from vggtjax.results.result import AnyResult, Result, mask_is_mined
 
 SOURCE = "mined: matched pixels and Gram similarities"
 _PIXELS, _WINDOW = 2, Window(4, 10)  # of a cell; movers can be five cells from where a static world shows them
@@ -33,40 +33,53 @@ _LEAST_MOTION = 1e-3  # by matches
 _LEAST = 0.2  # sum of the weights of a cell's matches, from which they tell its motion
 _SPECK = 0.25  # of a patch's pixels: smaller regions and holes of the mask are noise
 _OFFSET, _FLOOR = 0.25, 0.1  # score = log(difference + offset) + log(Gram + floor)
-_TIMES_MEDIAN = 4.0  # least motion without matches of the network; the score is then twice as wide
+_TIMES_MEDIAN_ALONE = 4.0  # least motion without matches of the network; the score is then twice as wide
+_FEWEST_MATCHED = 0.05  # share of the cells
+
+
+def takes_pixel_mask(result: Result) -> bool:
+    """Return whether `mask_by_pixels` mines the mask of a result.
+
+    It does not for fewer than three frames or more than 512, for equal frames, and for a mask that was given, or that
+    is refined by depth and cameras.
+    """
+    if not FEWEST_FRAMES <= len(result.depth) <= MOST_FRAMES or result.saliency is None:
+        return False
+    is_still = all((image == result.images[0]).all() for image in result.images)
+    return mask_is_mined(result) and not result.settings.get("refine_mask") and not is_still
 
 
 @own_settings()
-def mask_by_pixels(
-    result: AnyResult, pictures: Iterable[UInt8[np.ndarray, "h w 3"]] | None = None, *, smooth_frames: int = 1
-) -> AnyResult:
+def mask_by_pixels(result: AnyResult, pictures: Iterable[UInt8[np.ndarray, "h w 3"]] | None = None) -> AnyResult:
     """Return the result with the motion and the dynamic mask that its pixels tell, around its cameras and depth.
 
-    Stays as it is: a clip of fewer than three frames or more than 512, or of equal frames, or whose mask was not mined.
+    It stays as it is unless `takes_pixel_mask` says so and at least 5 % of the cells have matches.
 
     Args:
         result: cameras and depth that agree with the pixels, with the Gram saliency; the motion by matches is read
-            where there is one.
+            where there is one. Its `smooth_frames` are averaged.
         pictures: of the source, in the order of the frames; the result's own images if None.
-        smooth_frames: odd number of frames over which the motion is averaged (`smooth_over_time`).
 
     Raises ClipError for pictures that are missing, or of another size than the result's.
     """
-    if not FEWEST_FRAMES <= len(result.depth) <= MOST_FRAMES or result.saliency is None or not mines_mask(result):
-        return result
-    if all((image == result.images[0]).all() for image in result.images):
+    if result.saliency is None or not takes_pixel_mask(result):
         return result
     cells = cells_of(result)
     grey = grey_pictures(result, pictures, cells.grid)
     motion = pixel_motion(cells, grey, result.saliency, result.motion)
-    motion = np.asarray(smooth_over_time(jnp.asarray(motion[None]), smooth_frames))[0]
+    if motion is None:
+        return result
+    motion = np.asarray(smooth_over_time(jnp.asarray(motion[None]), result.settings.get("smooth_frames", 1)))[0]
     pixels = np.stack([_pixels(*each) for each in zip(motion, result.images, strict=True)])
-    times_median = _TIMES_MEDIAN if result.motion is None else TIMES_MEDIAN
-    mask = np.asarray(_mask(pixels, times_median))
-    mask = np.stack([_without_specks(frame, result.saliency[0].size) for frame in mask])
-    mask &= result.inside_pictures & (result.depth != 0)
+    seen = result.inside_pictures & (result.depth != 0)
+    times_median = _TIMES_MEDIAN_ALONE if result.motion is None else TIMES_MEDIAN
+    cut = max(threshold_otsu(pixels[seen]), times_median * np.median(pixels[seen]))
+    S, h, w = motion.shape
+    patches = seen.reshape(S, h, seen.shape[1] // h, w, -1)
+    mask = np.stack([_without_specks(frame, _SPECK * patches[0, 0, :, 0].size) for frame in seen & (pixels >= cut)])
     settings = result.settings | {"masks": SOURCE}
-    return dataclasses.replace(result, motion=motion / np.median(motion), dynamic_mask=mask, settings=settings)
+    motion = motion / np.median(motion[patches.any(axis=(2, 4))])
+    return dataclasses.replace(result, motion=motion, dynamic_mask=mask & seen, settings=settings)
 
 
 def pixel_motion(
@@ -74,8 +87,10 @@ def pixel_motion(
     grey: UInt8[np.ndarray, "S H W"],
     saliency: Float32[np.ndarray, "S h w"],
     motion: Float32[np.ndarray, "S h w"] | None,
-) -> Float32[np.ndarray, "S h w"]:
+) -> Float32[np.ndarray, "S h w"] | None:
     """Return the motion of every patch, positive: what pixels say, or its geometric mean with what matches say.
+
+    None where pixels say nothing: fewer than 5 % of the cells have matches.
 
     Pixels say how far they match from where a static world shows them, times the Gram saliency.
 
@@ -89,6 +104,8 @@ def pixel_motion(
     expected, warp = expected_matches(cells.depth, cells.cameras, grid)
     found = match_pixels(at_scale(grey, grid, _PIXELS), expected, warp, grid, _WINDOW)
     gram = _resized(saliency, grid, Image.Resampling.BILINEAR).reshape(S, -1)
+    if (found.weight.sum(axis=1) > _LEAST).mean() < _FEWEST_MATCHED:
+        return None
     score = np.log(_difference(expected, found) + _OFFSET) + np.log(gram.clip(0, 1) + _FLOOR)
     if motion is not None:
         matched = _resized(motion, grid, Image.Resampling.BILINEAR).reshape(S, -1)
@@ -107,10 +124,10 @@ def _difference(expected: Float32[np.ndarray, "S M P 2"], found: PixelMatches) -
     return np.where(total > _LEAST, mean, np.median(mean))
 
 
-def _without_specks(mask: Bool[np.ndarray, "H W"], patches: int) -> Bool[np.ndarray, "H W"]:
-    """Return a mask without regions and holes smaller than a quarter of a patch, of which no patch tells anything."""
-    most = int(_SPECK * mask.size / patches)
-    return remove_small_holes(remove_small_objects(mask, max_size=most), max_size=most)
+def _without_specks(mask: Bool[np.ndarray, "H W"], least: float) -> Bool[np.ndarray, "H W"]:
+    """Return a mask without regions and holes of fewer than `least` pixels."""
+    most = math.ceil(least) - 1
+    return remove_small_objects(remove_small_holes(mask, max_size=most), max_size=most)
 
 
 @jax.jit

@@ -154,8 +154,7 @@ class Growth:
         self._worlds = solve_graph(len(self.nodes), edges, reaches)
         old, times = self.nodes[0], _times(self.nodes[0], self.clip)
         settings = old.settings if times is not None else _without(old.settings, _TIMES)
-        made_otherwise = not str(settings.get("masks")).startswith(("mined", "none"))
-        settings |= {"masks": f"{settings.get('masks')}; mined in added frames"} if made_otherwise else {}
+        settings |= {"masks": self._masks()}
         earlier = settings.get("extended")
         windows = [self._facts(number, reaches[0]) for number in self._in_order()]
         facts = {"clip": self.clip.source.name, "first": len(old.depth), "frames": len(self.clip), "windows": windows}
@@ -175,6 +174,13 @@ class Growth:
         """Return the numbers of the windows in the order of their frames."""
         return sorted(range(len(self._windows)), key=lambda number: self._windows[number].frames.start)
 
+    def _masks(self) -> str:
+        """Return how the masks of old and new frames were made."""
+        old = str(self.nodes[0].settings.get("masks"))
+        ways = dict.fromkeys(str(window.result.settings.get("masks")) for window in self._windows)
+        added = [f"{way} in added frames" for way in ways if way != old]
+        return "; ".join([old, *(way for way in added if way not in old)])
+
     def _stacked(self, name: str) -> np.ndarray | None:
         """Return a field of the old frames, and of the new ones in the world of the old."""
         old = getattr(self.nodes[0], name)
@@ -188,7 +194,7 @@ class Growth:
             for number in self._in_order():
                 window, world = self._windows[number], self._worlds[number + 1]
                 value = getattr(window.result, name)
-                if value is None:  # the motion of a window whose matches could not be used: as the median everywhere
+                if value is None:  # a window without motion: as the median everywhere
                     value = np.ones((len(window.result.depth), *old.shape[1:]), old.dtype)
                 value = value[len(window.anchors) :]
                 value = world.scale * value if name == "depth" else value
