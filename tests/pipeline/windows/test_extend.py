@@ -92,6 +92,20 @@ def test_exact_windows_continue_a_result_exactly_and_its_frames_stay(backwards):
     assert any(len(nodes) > 1 for nodes in joins)
 
 
+def test_masks_of_added_frames_are_named_where_they_were_made_otherwise():
+    given = dataclasses.replace(exact(part_of_walk(slice(0, 30))), settings={"masks": "given"})
+    new = part_of_walk(slice(30, 45))
+
+    def mined(clip):
+        return dataclasses.replace(exact(clip), settings={"masks": "mined"})
+
+    both = joined(given, new, mined)
+    assert both.settings["masks"] == "given; mined in added frames"
+    again = joined(both, part_of_walk(slice(45, None)), mined)
+    assert again.settings["masks"] == both.settings["masks"]
+    assert "masks" not in joined(exact(part_of_walk(slice(0, 30))), new, exact).settings
+
+
 def test_a_result_of_windows_in_metres_grows(tmp_path):
     """Its arrays are mapped files, of which nothing is written to."""
     tools = walks.tools_of(exact)._replace(patches=features)

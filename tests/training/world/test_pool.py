@@ -120,10 +120,10 @@ def test_keys_of_what_moves_are_suppressed(clips):
     turns = set()
     for batch in seen:
         for number, of_clip in enumerate(zip(batch.regions, batch.clips.depth, batch.clips.tracks, strict=True)):
-            turn = 1 if np.array_equal(of_clip[1], np.float32(clips.depth[number])) else -1
+            turn = 1 if np.array_equal(of_clip[1], clips.depth[number].astype(np.float32)) else -1
             turns.add(turn)
             np.testing.assert_array_equal(of_clip[0], clips.moving[number][..., ::turn])
-            np.testing.assert_array_equal(of_clip[1], np.float32(clips.depth[number])[..., ::turn])
+            np.testing.assert_array_equal(of_clip[1], clips.depth[number].astype(np.float32)[..., ::turn])
             np.testing.assert_array_equal(np.unique(of_clip[2][..., 0]), np.unique(turn * clips.tracks[number][..., 0]))
     assert turns == {1, -1}
     never = make(jax.random.key(0), clips, dataclasses.replace(PHASE, masked_movers=0.0), 3)

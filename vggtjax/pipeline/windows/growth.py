@@ -154,7 +154,7 @@ class Growth:
         self._worlds = solve_graph(len(self.nodes), edges, reaches)
         old, times = self.nodes[0], _times(self.nodes[0], self.clip)
         settings = old.settings if times is not None else _without(old.settings, _TIMES)
-        settings |= {"masks": self._masks()}
+        settings |= self._masks()
         earlier = settings.get("extended")
         windows = [self._facts(number, reaches[0]) for number in self._in_order()]
         facts = {"clip": self.clip.source.name, "first": len(old.depth), "frames": len(self.clip), "windows": windows}
@@ -174,12 +174,13 @@ class Growth:
         """Return the numbers of the windows in the order of their frames."""
         return sorted(range(len(self._windows)), key=lambda number: self._windows[number].frames.start)
 
-    def _masks(self) -> str:
-        """Return how the masks of old and new frames were made."""
-        old = str(self.nodes[0].settings.get("masks"))
-        ways = dict.fromkeys(str(window.result.settings.get("masks")) for window in self._windows)
+    def _masks(self) -> dict[str, str]:
+        """Return how the masks of old and new frames were made, as a setting, where these differ."""
+        old = str(self.nodes[0].settings.get("masks", "made elsewhere"))
+        ways = dict.fromkeys(str(window.result.settings.get("masks", "made elsewhere")) for window in self._windows)
         added = [f"{way} in added frames" for way in ways if way != old]
-        return "; ".join([old, *(way for way in added if way not in old)])
+        added = [way for way in added if way not in old]
+        return {"masks": "; ".join([old, *added])} if added else {}
 
     def _stacked(self, name: str) -> np.ndarray | None:
         """Return a field of the old frames, and of the new ones in the world of the old."""
