@@ -11,8 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float32, UInt8
 from PIL import Image
-from skimage.filters import threshold_otsu
-from skimage.morphology import remove_small_holes, remove_small_objects
 
 from vggtjax.method.mask import smooth_over_time
 from vggtjax.method.matching.matched_mask import TIMES_MEDIAN, motion_pixels
@@ -62,6 +60,8 @@ def mask_by_pixels(result: AnyResult, pictures: Iterable[UInt8[np.ndarray, "h w 
 
     Raises ClipError for pictures that are missing, or of another size than the result's.
     """
+    from skimage.filters import threshold_otsu
+
     if result.saliency is None or not takes_pixel_mask(result):
         return result
     cells = cells_of(result)
@@ -126,6 +126,8 @@ def _difference(expected: Float32[np.ndarray, "S M P 2"], found: PixelMatches) -
 
 def _without_specks(mask: Bool[np.ndarray, "H W"], least: float) -> Bool[np.ndarray, "H W"]:
     """Return a mask without regions and holes of fewer than `least` pixels."""
+    from skimage.morphology import remove_small_holes, remove_small_objects
+
     most = math.ceil(least) - 1
     return remove_small_objects(remove_small_holes(mask, max_size=most), max_size=most)
 
