@@ -167,7 +167,8 @@ class _Trainer:
         """Do one step of the run."""
         run, recipe = self._run, self._run.recipe
         index, phase, frames = draw_shape(recipe, run.step)
-        program = phase, frames, draws_cameras(recipe, run.step)
+        knows_cameras = draws_cameras(recipe, run.step)
+        program = phase, frames, knows_cameras
         is_timed = self.timed < _TIMED and program in self._compiled
         wait = jax.block_until_ready if is_timed else lambda tree: tree
         wait(run.state)
@@ -178,7 +179,7 @@ class _Trainer:
             batch = self._make_batch(key, self._textures, phase, frames, recipe.model.patch_size)
         else:
             batch = self._make_world_batch(key, clips, phase, frames)
-        if program[-1]:
+        if knows_cameras:
             batch = dataclasses.replace(batch, known_cameras=True)
         wait(batch)
         rendered = time.perf_counter()

@@ -243,8 +243,13 @@ def test_two_frames_equal_frames_and_masks_of_other_sources_stay(room, monkeypat
         np.testing.assert_array_equal(made.dynamic_mask, each.dynamic_mask)
 
 
-def test_pictures_without_matches_leave_the_mask(room):
+def test_pictures_without_matches_and_depth_that_is_not_finite_leave_the_mask(room):
     pictures, result = room
+    for value, place in ((np.nan, np.s_[2, 9]), (np.inf, np.s_[:, :24]), (0, np.s_[:])):
+        depth = result.depth.copy()
+        depth[place] = value
+        broken = dataclasses.replace(result, depth=depth)
+        assert mask_by_pixels(broken, iter(pictures)).dynamic_mask.mean() < 0.03
     assert mask_by_pixels(result, iter(np.full_like(pictures, 90))) is result
 
 

@@ -51,7 +51,7 @@ def takes_pixel_mask(result: Result) -> bool:
 def mask_by_pixels(result: AnyResult, pictures: Iterable[UInt8[np.ndarray, "h w 3"]] | None = None) -> AnyResult:
     """Return the result with the motion and the dynamic mask that its pixels tell, around its cameras and depth.
 
-    It stays as it is unless `takes_pixel_mask` says so and at least 5 % of the cells have matches.
+    It stays as it is unless `takes_pixel_mask` says so, at least 5 % of the cells have matches, and depth is finite.
 
     Args:
         result: cameras and depth that agree with the pixels, with the Gram saliency; the motion by matches is read
@@ -67,11 +67,11 @@ def mask_by_pixels(result: AnyResult, pictures: Iterable[UInt8[np.ndarray, "h w 
     cells = cells_of(result)
     grey = grey_pictures(result, pictures, cells.grid)
     motion = pixel_motion(cells, grey, result.saliency, result.motion)
-    if motion is None:
+    seen = result.inside_pictures & (result.depth != 0)
+    if motion is None or not np.isfinite(motion).all() or not seen.any():
         return result
     motion = np.asarray(smooth_over_time(jnp.asarray(motion[None]), result.settings.get("smooth_frames", 1)))[0]
     pixels = np.stack([_pixels(*each) for each in zip(motion, result.images, strict=True)])
-    seen = result.inside_pictures & (result.depth != 0)
     times_median = _TIMES_MEDIAN_ALONE if result.motion is None else TIMES_MEDIAN
     cut = max(threshold_otsu(pixels[seen]), times_median * np.median(pixels[seen]))
     S, h, w = motion.shape
