@@ -14,6 +14,8 @@ from vggtjax.training.world.clip import world_clip
 from vggtjax.training.world.config import Cameras, Movers, Places, WorldConfig
 from vggtjax.training.world.meshes import Surface, box, join, pillar
 from vggtjax.training.world.motion import STEPS, Actor
+from vggtjax.training.world.places import make_place
+from vggtjax.training.world.sampling import draw_camera
 
 SIZE = {"frames": 4, "height": 32, "width": 48, "patch": 4}
 SHARP = WorldConfig(blur=0, rolling=0, compression=0, noise=0, flicker=0)
@@ -162,6 +164,27 @@ def test_folders_that_are_none_are_refused_in_a_sentence(tmp_path, spoil, words)
 def test_rows_out_of_range_are_refused(values):
     with pytest.raises(InputError):
         WorldConfig(**values)
+
+
+def test_tables_are_where_they_are_said_to_be_and_filmed_from_above(assets):
+    generator, tops = np.random.default_rng(4), 0
+    film = {share: dataclasses.replace(SHARP, tabletop=share) for share in (0.0, 1.0)}
+    down: dict[float, list[float]] = {0.0: [], 1.0: []}
+    for _ in range(12):
+        place = make_place(generator, assets, "room", 1.5)
+        if not place.tops:
+            continue
+        moment = Moment(Stage(World(prepare(join(place.still)), (), place.light, place.panorama, 0.0), assets.tiles), 0)
+        for top in place.tops:
+            above = np.add(top.point(generator), [0, 0, 0.6]).astype(np.float32)
+            below = moment.cast(above[None], np.array([[0, 0, -1]], np.float32)).distance[0]
+            assert below < 0.6 + 1e-3, "a ray from above meets the top or what stands on it"
+            tops += 1
+        for share, config in film.items():
+            rotation = draw_camera(generator, place, [], config, 1.0).path.pose(0.5)[0]
+            down[share].append(-rotation[2, 2])
+    assert tops > 10
+    assert np.mean(down[1.0]) > np.mean(down[0.0]) + 0.1
 
 
 def test_boxes_are_closed():

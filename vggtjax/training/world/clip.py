@@ -24,7 +24,7 @@ _LEAST_MOVING, _SPREAD = 0.01, 1.7  # of the pixels in some frame; of the 90th t
 _OPEN = 0.6  # largest share of a frame's time in which the shutter is open
 _READ = 0.03  # largest seconds between the first and the last row of a rolling shutter
 _MOST_ROLL = 2.0  # pixels by which the camera may turn meanwhile
-GENERATOR = 4  # raised with every change that gives a seed another clip
+GENERATOR = 5  # raised with every change that gives a seed another clip
 
 
 class WorldClip(NamedTuple):

@@ -51,6 +51,8 @@ class WorldConfig:
     Attributes:
         places, cameras, movers: weights of the kinds.
         dynamic: share of clips in which one to four things move.
+        tabletop: share of the clips of rooms with tables that film the top of one, and of their rigid movers that move
+            over one.
         clutter: factor of the number of things at rest, in [0, 4].
         seconds: range of the length of a clip; frames are at equal steps.
         motion: factor of what the camera travels and turns, in [0, 4].
@@ -68,6 +70,7 @@ class WorldConfig:
     cameras: Cameras = Cameras()
     movers: Movers = Movers()
     dynamic: Share = 0.5
+    tabletop: Share = 0.4
     clutter: Annotated[float, Meta(ge=0, le=4)] = 1.0
     seconds: tuple[Seconds, Seconds] = (0.6, 6.0)
     motion: Annotated[float, Meta(ge=0, le=4)] = 1.0

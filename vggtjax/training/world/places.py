@@ -2,30 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import NamedTuple, TypeVar
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
 from vggtjax.training.world.assets import Assets, Shape
 from vggtjax.training.world.casting import Light
-from vggtjax.training.world.meshes import (
-    Mesh,
-    Surface,
-    boulder,
-    box,
-    of_shape,
-    picture,
-    pillar,
-    relief,
-)
+from vggtjax.training.world.meshes import Mesh, Surface, boulder, box, picture, pillar, relief
 from vggtjax.training.world.motion import turned
+from vggtjax.training.world.stock import (
+    SMALL,
+    furniture,
+    pick,
+    standing,
+    still_shapes,
+    surface,
+    tint,
+    vehicles,
+    walkers,
+)
+from vggtjax.training.world.tables import Top, cupboard, table
 
-T = TypeVar("T")
+_LOW = 1.1  # metres: the largest height of a top that is looked down at
+
 Spot = tuple[float, float, float]  # x, y, heading
-
-_SMALL, _VEHICLE = 2.7, 13.0  # metres: largest extent of furniture, of vehicles
-_FLAT = 3.6  # metres: largest height of vehicles
 
 
 class Place(NamedTuple):
@@ -42,6 +43,7 @@ class Place(NamedTuple):
     light: Light
     panorama: np.ndarray
     indoors: bool
+    tops: tuple[Top, ...] = ()  # of tables and low cupboards
 
     def ground(self, x: float, y: float) -> float:
         """Return the height of the ground at a point."""
@@ -51,54 +53,6 @@ class Place(NamedTuple):
 def make_place(generator: np.random.Generator, assets: Assets, kind: str, clutter: float) -> Place:
     """Return a random place of a kind; `clutter` scales the number of things in it."""
     return _PLACES[kind](generator, assets, clutter)
-
-
-def walkers(assets: Assets) -> list[Shape]:
-    """Return the shapes with a gait."""
-    return [shape for shape in assets.shapes.values() if shape.rate]
-
-
-def vehicles(assets: Assets) -> list[Shape]:
-    """Return the shapes of the size of vehicles: longer than furniture, lower than houses, longer than high."""
-    return [
-        shape
-        for shape in _still(assets)
-        if min(shape.extent) > 1.2 and _SMALL < max(shape.extent) < _VEHICLE
-        if shape.extent[2] < min(_FLAT, max(shape.extent) / 1.3)
-    ]
-
-
-def furniture(assets: Assets) -> list[Shape]:
-    """Return the shapes that fit into a room."""
-    return [s for s in _still(assets) if max(s.extent) < _SMALL]
-
-
-def standing(shape: Shape, x: float, y: float, z: float, heading: float, gain, pose: int = 0) -> Mesh:
-    """Return a shape at rest at a place."""
-    return of_shape(shape, gain, pose).moved(turned(np.array([heading, 0, 0])), np.array([x, y, z]))
-
-
-def tint(generator: np.random.Generator, spread: float = 0.25) -> tuple[float, float, float]:
-    """Return random gains of the three channels."""
-    gains = generator.uniform(0.75, 1.25) * (1 + generator.uniform(-spread, spread, 3))
-    return float(gains[0]), float(gains[1]), float(gains[2])
-
-
-def surface(generator: np.random.Generator, assets: Assets, row: str, low: float, high: float) -> Surface:
-    """Return a material of a row of MATERIALS, or now and then any, repeated `low` to `high` times a metre."""
-    row = "any" if generator.random() < 0.15 else row
-    repeat = np.exp(generator.uniform(np.log(low), np.log(high)))
-    turn = generator.choice([0.0, np.pi / 2, generator.uniform(0, 2 * np.pi)], p=[0.5, 0.3, 0.2])
-    return Surface(int(generator.choice(assets.materials[row])), repeat, tint(generator), turn)
-
-
-def _still(assets: Assets) -> list[Shape]:
-    return [shape for shape in assets.shapes.values() if not shape.rate]
-
-
-def pick(generator: np.random.Generator, items: Sequence[T]) -> T:
-    """Return one of the items, each as likely as another."""
-    return items[int(generator.integers(len(items)))]
 
 
 def _sun(generator: np.random.Generator) -> Light:
@@ -118,7 +72,7 @@ def _scatter(
         z = place.ground(x, y)
         draw = generator.random()
         if draw < 0.62:
-            shape = pick(generator, shapes or _still(assets))
+            shape = pick(generator, shapes or still_shapes(assets))
             made.append(standing(shape, x, y, z, heading, tint(generator, 0.12)))
         elif draw < 0.72 and walkers(assets):  # of the kinds that move in other clips
             shape = pick(generator, walkers(assets))
@@ -162,7 +116,7 @@ def _room(generator: np.random.Generator, assets: Assets, clutter: float) -> Pla
             index, share = int(draw.integers(4)), draw.uniform(0.08, 0.92)
             a, b = corners[index], corners[(index + 1) % 4]
             x, y = (a + share * (b - a)) * (1 - 0.45 / half)
-            return x, y, index * np.pi / 2
+            return x, y, index * np.pi / 2 + np.pi  # its back to the wall
         x, y = draw.uniform(-0.8, 0.8, 2) * half
         return x, y, draw.uniform(0, 2 * np.pi)
 
@@ -170,11 +124,22 @@ def _room(generator: np.random.Generator, assets: Assets, clutter: float) -> Pla
         x, y = draw.uniform(-0.6, 0.6, 2) * half
         return x, y, draw.uniform(0, 2 * np.pi)
 
+    tops = []
+    for _ in range(round(clutter * generator.uniform(0, 1.5 + w * d / 5))):
+        x, y, heading = lane(generator, False) if generator.random() < 0.6 else spot(generator)
+        parts, top = table(generator, assets, [x, y, 0], heading)
+        made, tops = made + parts, [*tops, top]
+    for _ in range(round(clutter * generator.uniform(0, 4))):
+        index, share = int(generator.integers(4)), generator.uniform(0.1, 0.9)
+        a, b = corners[index], corners[(index + 1) % 4]
+        x, y = (a + share * (b - a)) * (1 - 0.32 / half)
+        parts, top = cupboard(generator, assets, [x, y, 0], index * np.pi / 2 + np.pi)
+        made, tops = made + parts, [*tops, top] if top.middle[2] < _LOW else tops
     ambient, colour = generator.uniform(0.4, 0.85), 1 + generator.uniform(-0.1, 0.1, 3)
     light = Light(np.array([*lamp, 0.92 * tall]), True, ambient, colour)
     reach, inside = (0.8, float(1.4 * max(half))), 0.88 * half
     sky, eye = pick(generator, assets.panoramas), 0.85 * tall
-    place = Place(made, lambda x, y: 0.0 * x, spot, lane, reach, -inside, inside, eye, light, sky, True)
+    place = Place(made, lambda x, y: 0.0 * x, spot, lane, reach, -inside, inside, eye, light, sky, True, tuple(tops))
     count = round(clutter * generator.uniform(2, 3 + 3.5 * w * d / 4))
     made += _scatter(generator, assets, place, furniture(assets), count)
     return place
@@ -223,7 +188,7 @@ def _street(generator: np.random.Generator, assets: Assets, clutter: float) -> P
 
     high, sky = np.array([0.6 * length, edge]), pick(generator, assets.panoramas)
     place = Place(made, height, spot, lane, (2.0, 18.0), -high, high, 3.5, _sun(generator), sky, False)
-    poles = [s for s in _still(assets) if _SMALL < s.extent[2] < 10 and max(s.extent[:2]) < 2.5]
+    poles = [s for s in still_shapes(assets) if SMALL < s.extent[2] < 10 and max(s.extent[:2]) < 2.5]
     things = poles + [s for s in furniture(assets) if s.extent[2] > 0.3]
     made += _scatter(generator, assets, place, things, round(clutter * generator.uniform(3, 18)))
     for sign in (-1, 1):  # parked where others drive
@@ -271,7 +236,7 @@ def _landscape(generator: np.random.Generator, assets: Assets, clutter: float) -
 
     limit, sky = np.array([0.25, 0.25]) * size, pick(generator, assets.panoramas)
     place = Place(made, height, spot, lane, (1.5, 16.0), -limit, limit, 3.5, _sun(generator), sky, False)
-    houses = [s for s in _still(assets) if max(s.extent) > 4]
+    houses = [s for s in still_shapes(assets) if max(s.extent) > 4]
     made += _scatter(generator, assets, place, furniture(assets) + houses, round(clutter * generator.uniform(1, 10)))
     for _ in range(int(clutter * generator.uniform(2, 22))):
         x, y, heading = spot(generator)

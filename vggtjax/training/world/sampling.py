@@ -11,11 +11,14 @@ from vggtjax.training.world.assets import Assets
 from vggtjax.training.world.config import Cameras, Movers, Places, WorldConfig
 from vggtjax.training.world.meshes import Mesh, Surface, boulder, box, cutout, of_shape
 from vggtjax.training.world.motion import STEPS, Actor, CameraPath, wander
-from vggtjax.training.world.places import Place, furniture, pick, surface, tint, vehicles, walkers
+from vggtjax.training.world.places import Place
+from vggtjax.training.world.stock import furniture, pick, surface, tint, vehicles, walkers
 
 _FACING = np.pi / 2  # shapes look along -y; a heading of 0 is along x
 _GAIT = {"run": 3.2, "gallop": 5.5}  # metres a second; others walk
 _WALK = 1.3
+_HELD = 0.5  # metres: largest extent of what moves over a table
+_AT_A_TABLE = (0.25, 2.2)  # metres, in the plane: range of the distance from the camera to the point that it films
 
 
 class Filmed(NamedTuple):
@@ -36,7 +39,7 @@ def draw_actors(
 ) -> list[Actor]:
     """Return one to four things that move, which may enter and leave the picture."""
     count = 1 + int(generator.choice(4, p=[0.45, 0.3, 0.15, 0.1]))
-    return [_actor(generator, assets, place, choose(generator, config.movers), seconds) for _ in range(count)]
+    return [_actor(generator, assets, place, config, seconds) for _ in range(count)]
 
 
 def draw_camera(
@@ -46,14 +49,18 @@ def draw_camera(
     kind = choose(generator, config.cameras)
     kind = "walk" if kind == "follow" and not actors else kind
     middle = STEPS // 2
+    subject, reach = np.zeros((STEPS, 3)), place.reach
     if actors and (kind == "follow" or generator.random() < 0.8):
-        subject = pick(generator, actors).place
-        target = subject[middle] + [0, 0, generator.uniform(0.2, 1.3)]
+        actor = pick(generator, actors)
+        subject, size = actor.place, float(np.ptp(actor.poses[0], axis=0).max())
+        target = subject[middle] + [0, 0, generator.uniform(0.2, 0.8) * min(size, 1.6)]
+        reach = min(reach[0], 0.3 + 2 * size), min(reach[1], 0.6 + 12 * size)
+    elif place.tops and generator.random() < config.tabletop:
+        target, reach = pick(generator, place.tops).point(generator), _AT_A_TABLE
     else:
         x, y, _ = place.spot(generator)
-        subject = np.zeros((STEPS, 3))
         target = np.array([x, y, place.ground(x, y) + generator.uniform(0.2, 1.6)])
-    distance = np.exp(generator.uniform(*np.log(place.reach)))
+    distance = np.exp(generator.uniform(*np.log(reach)))
     angle = generator.uniform(0, 2 * np.pi)
     start = np.clip(target[:2] + distance * np.array([np.cos(angle), np.sin(angle)]), place.low, place.high)
     eye = min(np.exp(generator.normal(np.log(1.45), 0.28)), place.ceiling)
@@ -98,14 +105,15 @@ def _spun(vectors: np.ndarray, angles: np.ndarray) -> np.ndarray:
     return np.stack([c * x - s * y, s * x + c * y, z], axis=-1)
 
 
-def _actor(generator: np.random.Generator, assets: Assets, place: Place, kind: str, seconds: float) -> Actor:
-    """Return a mover of a kind; where the folder has none of it, one that it has."""
+def _actor(generator: np.random.Generator, assets: Assets, place: Place, config: WorldConfig, seconds: float) -> Actor:
+    """Return a mover of a kind that is drawn; where the folder has none of it, one that it has."""
+    kind = choose(generator, config.movers)
     kind = "thing" if (kind == "walker" and not walkers(assets)) else kind
     kind = "thing" if kind == "vehicle" and (place.indoors or not vehicles(assets)) else kind
-    return _KINDS[kind](generator, assets, place, seconds)
+    return _KINDS[kind](generator, assets, place, config, seconds)
 
 
-def _walker(generator: np.random.Generator, assets: Assets, place: Place, seconds: float) -> Actor:
+def _walker(generator: np.random.Generator, assets: Assets, place: Place, _: WorldConfig, seconds: float) -> Actor:
     name, shape = pick(generator, [item for item in assets.shapes.items() if item[1].rate])
     pace = generator.uniform(0.7, 1.3)
     speed = pace * next((value for gait, value in _GAIT.items() if gait in name), _WALK)
@@ -115,38 +123,44 @@ def _walker(generator: np.random.Generator, assets: Assets, place: Place, second
     return _made(generator, mesh, shape.vertices * np.asarray(size, np.float32), shape.rate * pace, seconds, *ground)
 
 
-def _vehicle(generator: np.random.Generator, assets: Assets, place: Place, seconds: float) -> Actor:
+def _vehicle(generator: np.random.Generator, assets: Assets, place: Place, _: WorldConfig, seconds: float) -> Actor:
     shape = pick(generator, vehicles(assets))
     speed = np.exp(generator.uniform(np.log(0.8), np.log(12)))
     ground = _on_ground(generator, place, seconds, speed, generator.normal(0, 0.08), driven=True)
     return _made(generator, of_shape(shape, tint(generator)), shape.vertices, 0.0, seconds, *ground)
 
 
-def _thing(generator: np.random.Generator, assets: Assets, place: Place, seconds: float) -> Actor:
-    """Return a rigid thing that slides, hops, hovers or tumbles."""
-    draw, shapes = generator.random(), furniture(assets)
+def _thing(generator: np.random.Generator, assets: Assets, place: Place, config: WorldConfig, seconds: float) -> Actor:
+    """Return a rigid thing that slides, hops, hovers or tumbles, on the ground or, small and slow, over a table."""
+    draw, shapes, top = generator.random(), furniture(assets), None
+    if place.tops and generator.random() < config.tabletop:
+        top = pick(generator, place.tops)
+        shapes = [shape for shape in shapes if max(shape.extent) < _HELD]
     if draw < 0.5 and shapes:
         mesh = of_shape(pick(generator, shapes), tint(generator))
     else:
-        size = np.exp(generator.uniform(np.log(0.15), np.log(1.2), 3))
+        low, high = (0.05, _HELD) if top else (0.15, 1.2)
+        size = np.exp(generator.uniform(np.log(low), np.log(high), 3))
         look = surface(generator, assets, "any", 0.5, 3)
         mesh = box(size, look) if draw < 0.75 else boulder(generator, size, 0.2, look)
-    speed = np.exp(generator.uniform(np.log(0.05), np.log(3)))
+    speed = np.exp(generator.uniform(np.log(0.05), np.log(0.6 if top else 3)))
     path, turn = _on_ground(generator, place, seconds, speed, generator.normal(0, 1.0), driven=False)
+    if top:
+        path = path - path[STEPS // 2] + top.point(generator)
     if generator.random() < 0.6:
         hop = np.abs(wander(generator, generator.uniform(0.05, 0.6), seconds, 0.3, 1.2, 1))
-        path = path + (generator.uniform(0.2, 1.2) + hop) * [0, 0, 1]
+        path = path + (generator.uniform(0.2, 1.2) + hop) * [0, 0, 0.3 if top else 1]
         turn = turn + wander(generator, generator.uniform(0.1, 1.5), seconds, 0.1, 0.8, 3)
     return _made(generator, mesh, mesh.vertices[None], 0.0, seconds, path, turn)
 
 
-def _cutout(generator: np.random.Generator, assets: Assets, place: Place, seconds: float) -> Actor:
+def _cutout(generator: np.random.Generator, assets: Assets, place: Place, _: WorldConfig, seconds: float) -> Actor:
     """Return an upright piece of a photograph that slides and turns a little."""
     look = Surface(int(generator.choice(assets.materials["picture"])), gain=tint(generator, 0.1))
     width, height = generator.uniform(0.4, 2.0, 2)
     mesh = cutout(generator, width, height, look)
     speed = np.exp(generator.uniform(np.log(0.1), np.log(3)))
-    path, _ = _on_ground(generator, place, seconds, speed, 0.0, driven=False)
+    path = _on_ground(generator, place, seconds, speed, 0.0, driven=False)[0]
     path = path + np.array([0, 0, generator.uniform(0, 0.8)]) + wander(generator, 0.1, seconds, 0.3, 1.5, 3)
     turn = [generator.uniform(0, 2 * np.pi), 0, 0] + wander(generator, 0.1, seconds, 0.2, 0.8, 3) * [1, 0.05, 0.05]
     return _made(generator, mesh, mesh.vertices[None], 0.0, seconds, path, turn)
