@@ -9,12 +9,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as Bars
 
 from benchmarks.blind_guesses import Comparison, Guess, Prior, compare, guesses, training_prior
+from benchmarks.held_out import held_out_truth
 from benchmarks.plots import plot_ladder, plot_sweep
 from benchmarks.real_clips import Windows, load_windows
 from benchmarks.summaries import (
@@ -26,15 +26,14 @@ from benchmarks.summaries import (
     saliency_auc,
     summarise,
 )
-from vggtjax.clips.truth import Truth, batched_truth
+from vggtjax.clips.truth import Truth
 from vggtjax.errors import InputError, check_extra
 from vggtjax.network.checkpoint import Model
 from vggtjax.pipeline.pretrained.load import load_model
 from vggtjax.progress import Progress
 from vggtjax.research.evaluation.ladder import LadderRow, MaskSource, ladder
 from vggtjax.storage.writing import staging, writing
-from vggtjax.training.scenes import SceneConfig, held_out_scenes
-from vggtjax.training.world.truth import worlds_with_truth
+from vggtjax.training.scenes import SceneConfig
 
 CLIPS = Path(__file__).parents[2] / "shared" / "clips"
 SUPPRESS = ("zero", "drop")
@@ -213,13 +212,8 @@ class _Bench:
         return Laddered(rows, summarise(main), summarise(swept), saliency_auc(rows))
 
     def scenes(self, kind: Literal["static", "dynamic"], count: int, seed: int) -> Truth:
-        frames, assets = self.settings.frames, self.settings.assets
-        if assets is not None:
-            shape = {"frames": frames, "height": self.height, "width": self.width}
-            worlds = [*worlds_with_truth(assets, kind, count, split="test", seed=seed, **shape)]
-            return Truth(*(np.stack(arrays) for arrays in zip(*worlds, strict=True)))
-        config = SceneConfig(self.height, self.width, frames, dynamic=kind == "dynamic")
-        return batched_truth(held_out_scenes(kind, count, config, seed=seed))
+        config = SceneConfig(self.height, self.width, self.settings.frames, dynamic=kind == "dynamic")
+        return held_out_truth(kind, count, config, seed=seed, assets=self.settings.assets)
 
     def prior(self, height: int, width: int) -> Prior:
         if (height, width) not in self.priors:

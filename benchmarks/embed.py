@@ -12,6 +12,7 @@ import numpy as np
 from rich.console import Console
 from scipy.stats import rankdata
 
+from benchmarks.held_out import held_out_truth
 from vggtjax.clips.truth import Truth
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
@@ -22,14 +23,23 @@ from vggtjax.pipeline.pretrained.embedded import CLIP, MODEL, NEAREST, NOTE, STE
 from vggtjax.pipeline.pretrained.load import load_model
 from vggtjax.research.evaluation.ladder import ladder
 from vggtjax.storage.writing import writing
-from vggtjax.training.scenes import SceneConfig, held_out_scenes
+from vggtjax.training.scenes import SceneConfig
 
 MOST_MODEL_BYTES = 24 << 20
 MOST_CLIP_BYTES = 1 << 20
 SCENE_SEED = 100  # of held-out dynamic scenes; the clip is one of them; no evaluation uses this seed
 
 
-def embed(model: str, /, *, frames: int = 16, scenes: int = 45, image_size: int | None = None) -> None:
+def embed(
+    model: str,
+    /,
+    *,
+    frames: int = 16,
+    scenes: int = 45,
+    image_size: int | None = None,
+    height: int | None = None,
+    assets: Path | None = None,
+) -> None:
     """Write the model, in bfloat16, and a held-out dynamic clip into the package.
 
     The clip is a typical one of `scenes`. Scenes are ranked by the rotation error and by the centres' error of the
@@ -43,6 +53,8 @@ def embed(model: str, /, *, frames: int = 16, scenes: int = 45, image_size: int 
         scenes: number of held-out scenes that the clip is chosen from, three times an odd number.
         image_size: side in pixels that the model was last trained at, which becomes its own and the clip's; the
             model's own by default.
+        height: of the clip in pixels, a multiple of the model's patch size; `image_size` by default.
+        assets: folder of textures, photographs and objects: the clip is a world of its test split instead of a room.
     """
     loaded = load_model(model)
     side = image_size or loaded.config.image_size
@@ -50,9 +62,8 @@ def embed(model: str, /, *, frames: int = 16, scenes: int = 45, image_size: int 
     params = {**loaded.params, "backbone": _at_size(loaded.params["backbone"], loaded.config, network)}
     params = jax.tree.map(lambda leaf: np.asarray(leaf).astype(numpy_dtype("bfloat16")), params)
     save_model(MODEL, params, network, name="demo", note=NOTE, untrained_heads=UNTRAINED_HEADS)
-    config = SceneConfig(height=side, width=side, frames=frames, samples=3)
-    clips = held_out_scenes("dynamic", scenes, config, seed=SCENE_SEED)
-    truth = Truth(*(getattr(clips, name) for name in Truth._fields))
+    config = SceneConfig(height=height or side, width=side, frames=frames, samples=3)
+    truth = held_out_truth("dynamic", scenes, config, seed=SCENE_SEED, assets=assets)
     scene = _typical_scene(demo_model(), truth)
     write_demo_clip(CLIP, Truth(*(array[scene] for array in truth)))
     console = Console()
@@ -66,7 +77,7 @@ def embed(model: str, /, *, frames: int = 16, scenes: int = 45, image_size: int 
 
 def write_demo_clip(path: Path, truth: Truth) -> None:
     """Write a clip for `demo_clip`: colours in 8 bits, depth in 16 bits, the mask in 1 bit."""
-    steps = np.log(np.maximum(truth.depth, NEAREST) / NEAREST) / STEP
+    steps = np.log(np.maximum(truth.depth, NEAREST) / NEAREST) / STEP  # 0 where depth is not known
     content = io.BytesIO()
     np.savez_compressed(
         content,

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from benchmarks import __main__ as benchmarks
-from benchmarks import command_worker, embed, static_mesh
+from benchmarks import command_worker, embed, held_out, static_mesh
 from tests.benchmarks.scenes import SIDE, drawn_scenes, tiny_file
+from tests.shared.asset_folder import write_assets
 from vggtjax.clips.truth import Truth
 from vggtjax.errors import InputError
 from vggtjax.network.checkpoint import read_model
@@ -25,7 +26,7 @@ def tiny(tmp_path_factory):
 @pytest.fixture
 def run(monkeypatch, capsys):
     """Run a command in this process, on scenes that are not rendered; return what it prints."""
-    for module in (embed, static_mesh):
+    for module in (held_out, static_mesh):
         monkeypatch.setattr(module, "held_out_scenes", drawn_scenes)
     level = logging.getLogger("vggtjax").level
 
@@ -76,10 +77,12 @@ def test_a_clip_survives_the_file(tmp_path):
         camera_from_world=generator.normal(size=(3, 3, 4)).astype(np.float32),
         intrinsics=generator.normal(size=(3, 3, 3)).astype(np.float32),
     )
+    truth.depth[:, 0] = 0  # not known
     embed.write_demo_clip(tmp_path / "clip.npz", truth)
     again = demo_clip(tmp_path / "clip.npz")
     assert np.abs(again.images - truth.images).max() <= 0.5 / 255 + 1e-6
-    assert np.abs(again.depth / truth.depth - 1).max() < 4e-4
+    assert not again.depth[:, 0].any()
+    assert np.abs(again.depth[:, 1:] / truth.depth[:, 1:] - 1).max() < 4e-4
     for name in ("dynamic_mask", "camera_from_world", "intrinsics"):
         assert np.array_equal(getattr(again, name), getattr(truth, name))
 
@@ -93,6 +96,9 @@ def test_embed(run, tiny, tmp_path, monkeypatch):
     assert (model.name, model.config.image_size) == ("demo", 2 * SIDE)
     assert f"{(tmp_path / 'CLIP').stat().st_size} bytes" in shown
     assert demo_clip(tmp_path / "CLIP").images.shape == (3, 2 * SIDE, 2 * SIDE, 3)
+    folder = write_assets(tmp_path / "assets")
+    run("embed", tiny, "--scenes", 3, "--frames", 3, "--image-size", 2 * SIDE, "--height", SIDE, "--assets", folder)
+    assert demo_clip(tmp_path / "CLIP").images.shape == (3, SIDE, 2 * SIDE, 3)
     assert embed._by_ranks(np.array([[3, 3], [1, 2], [2, 1.5]])).tolist() == [1, 2, 0]
 
 

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks import __main__ as benchmarks
-from benchmarks import demo_model
+from benchmarks import demo_model, held_out
 from benchmarks.blind_guesses import Prior, compare, guesses, mean_depth_map
 from benchmarks.real_clips import Windows, load_windows, window_starts
 from benchmarks.summaries import changes_table, comparison_table, ladder_table, saliency_auc, spread, summarise
@@ -94,7 +94,7 @@ def test_guesses_and_comparisons_by_hand():
 
 @pytest.mark.proof
 def test_a_small_run_of_everything(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(demo_model, "held_out_scenes", drawn_scenes)
+    monkeypatch.setattr(held_out, "held_out_scenes", drawn_scenes)
     monkeypatch.setattr(demo_model, "SUPPRESS", ("zero",))
     prior = Prior(np.full((SIDE, SIDE), 2.0), np.array([0, 0.1, 0]))
     monkeypatch.setattr(demo_model, "training_prior", lambda config, scenes, progress: prior)
