@@ -71,6 +71,12 @@ def test_depth_and_cameras_come_to_the_truth(corner, pictures, truth, predicted)
     np.testing.assert_array_equal(made.dynamic_mask, predicted.dynamic_mask)
 
 
+def test_cameras_that_are_far_off_are_found(corner, pictures, truth):
+    turned = corner_result(corner, degrees=20, share=0)
+    made, _ = consistent_depth(turned, iter(pictures))
+    assert errors(made, truth, corner)[1] < 0.02 * errors(turned, truth, corner)[1]
+
+
 def test_its_own_small_pictures_are_enough_to_get_better(corner, pictures, truth, predicted):
     own = dataclasses.replace(predicted, images=pictures[:, 1::SCALE, 1::SCALE])
     made, report = consistent_depth(own, join=False)

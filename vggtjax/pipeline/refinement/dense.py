@@ -35,7 +35,8 @@ class Round(NamedTuple):
 
 
 ROUNDS = (
-    Round(2, Window(4, 10), 2.0),  # predicted cameras can be off by many cells
+    Round(1, Window(3, 12), 2.0),  # predicted cameras can be off by half a picture
+    Round(2, Window(4, 10), 2.0),
     Round(2, Window(4, 6), 1.0),
     Round(4, Window(4, 4), 0.4),
     Round(8, Window(4, 4), 0.16),
