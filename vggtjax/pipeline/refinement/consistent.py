@@ -48,7 +48,9 @@ class ConsistencyReport:
 
     changed: bool
     reason: str = ""  # why depth and cameras stayed
-    cells: float = 0.0  # share of the frames' cells whose depth is known from matched pixels
+    cells: float = (
+        0.0  # share of the frames' cells whose depth matched pixels tell; that match, if cameras change alone
+    )
     points: int = 0  # observations of bundle-adjusted points
     change: float = 0.0  # mean |log| by which depth changed
     layers_before: float = 0.0  # median |log| between the depths of frames that see one place
@@ -122,23 +124,28 @@ def consistent_depth(
     world = adjust_to_pixels(cells, grey, priors, on_round=step)
     if points is not None and _turned(start, world) > _MOST_TURNED:
         points = None  # the bundle adjustment ended in a wrong place
+    if world.matched < _FEWEST_MATCHED or not np.isfinite(world.camera_from_world).all():
+        share = f"{world.matched:.1%} of the picture matches other frames"
+        return _kept(result, f"{share}; at least {_FEWEST_MATCHED:.0%} is needed (texture)")
     known = world.information > _KNOWN
-    if known.mean() < _FEWEST_MATCHED or not np.isfinite(world.camera_from_world).all():
-        text = f"matched pixels tell the depth of {known.mean():.1%} of the picture; at least {_FEWEST_MATCHED:.0%} are"
-        return _kept(result, text + " needed (texture, and a camera that moves)")
-    measured = _measured(cells, world)
-    if points is not None:
-        measured = Measured(*map(np.concatenate, zip(measured, points, strict=True)))
-    fields = fit_field(measured, frames, size, field or FieldPrior.of_error(world.error))
-    before = differences(result, step)
-    made, change = _by_field(start, world, fields, step)
-    after, most = differences(made, step), _MOST_WORSE
     zooms = priors.focal is not None and abs(world.zoom) > _MOST_ZOOM
-    if zooms or world.parallax < _LEAST_PARALLAX or not _agree(before, after, most):  # cameras alone
-        made, change = _by_field(start, world, 0 * fields, lambda: None)
-        after, most, points = differences(made), 1.0, None
-    if not _agree(before, after, most):
-        return _kept(result, "no depth was found by which the frames agree better")
+    stands = known.mean() < _FEWEST_MATCHED or world.parallax < _LEAST_PARALLAX
+    by_cameras, made, change = _with_cameras(start, world), None, 0.0
+    before = after = differences(result, step)
+    if not zooms and not stands:
+        measured = _measured(cells, world)
+        if points is not None:
+            measured = Measured(*map(np.concatenate, zip(measured, points, strict=True)))
+        fields = fit_field(measured, frames, size, field or FieldPrior.of_error(world.error))
+        fitted, change = _by_field(by_cameras, fields, step)
+        after = differences(fitted, step)
+        made = fitted if _agree(before, after, _MOST_WORSE) else None
+    told = float(known.mean()) if made is not None else world.matched
+    if made is None:  # cameras alone
+        made, change, points = by_cameras, 0.0, None
+        after = differences(made)
+        if not _agree(before, after, 1.0):
+            return _kept(result, "no depth was found by which the frames agree better")
     share = 0.0
     if join:
         made, share = _joined(made, tolerance_of(after), step)
@@ -146,7 +153,7 @@ def consistent_depth(
     tell(total, total)
     layers = (float(np.median(before)), float(np.median(after)))
     observations = 0 if points is None else len(points.frame)
-    return _reported(made, ConsistencyReport(True, "", float(known.mean()), observations, change, *layers, share))
+    return _reported(made, ConsistencyReport(True, "", told, observations, change, *layers, share))
 
 
 def _agree(before: Float32[np.ndarray, " N"], after: Float32[np.ndarray, " M"], most: float) -> bool:
@@ -178,19 +185,21 @@ def _turned(result: Result, world: DenseWorld) -> float:
     return float(np.degrees((after * before.inv()).magnitude().mean()))
 
 
-def _by_field(
-    result: AnyResult, world: DenseWorld, fields: np.ndarray, step: Callable[[], None]
-) -> tuple[AnyResult, float]:
-    """Return the result with the world's cameras and depth times the fields' scales, and the mean |log| of these."""
+def _with_cameras(result: AnyResult, world: DenseWorld) -> AnyResult:
+    """Return the result with the world's cameras."""
+    intrinsics, poses = zoomed(result.intrinsics, world.focal), world.camera_from_world.astype(np.float32)
+    return dataclasses.replace(result, camera_from_world=poses, intrinsics=intrinsics)
+
+
+def _by_field(result: AnyResult, fields: np.ndarray, step: Callable[[], None]) -> tuple[AnyResult, float]:
+    """Return the result with depth times the fields' scales, and the mean |log| of these."""
     size, depth, change = result.depth.shape[1:], zeros_beside(result.depth, np.float32), []
     for frame, field in enumerate(fields):
         logs = at_pixels(field, (size[0], size[1]))
         depth[frame] = result.depth[frame] * np.exp(logs)
         change.append(np.abs(logs).mean())
         step()
-    intrinsics, poses = zoomed(result.intrinsics, world.focal), world.camera_from_world.astype(np.float32)
-    made = dataclasses.replace(result, depth=depth, camera_from_world=poses, intrinsics=intrinsics)
-    return made, float(np.mean(change))
+    return dataclasses.replace(result, depth=depth), float(np.mean(change))
 
 
 def _joined(result: AnyResult, tolerance: float, step: Callable[[], None]) -> tuple[AnyResult, float]:

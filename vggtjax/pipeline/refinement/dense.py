@@ -20,6 +20,7 @@ from vggtjax.pipeline.refinement.pixel_matches import Window, expected_matches, 
 _ANNEALED = (4.0, 3.0, 2.0, 1.5, 1.0, 1.0, 1.0, 1.0)
 _DEPTH_PRIOR = 0.6  # standard deviation of a log depth from the network's, in the rounds
 _DAMPING = 1e-5
+_LEAST_WEIGHT = 0.2  # sum of the weights of a cell's matches, from which it counts as matched
 _SURE = 0.1  # deviation of a measured log depth, up to which it tells the network's error
 _FEWEST_SURE = 20
 _DEPTHS = (1e-6, 1e6)  # range of a measured depth
@@ -64,6 +65,7 @@ class DenseWorld(NamedTuple):
     focal: float  # factor of all focal lengths
     depth: Float32[np.ndarray, "S P"]  # what matches alone say of each, cameras given
     information: Float32[np.ndarray, "S P"]  # inverse variance of its log
+    matched: float  # share of the cells with matches
     error: float  # standard deviation of the network's log depth, as far as measured
     parallax: float  # cells by which the middle cell moves in the frame that sees it move most, for a log depth of 1
     zoom: float  # by which matches are further from the middle than one focal length puts them, for each frame of time
@@ -119,16 +121,17 @@ def adjust_to_pixels(
         weight = found.weight * cells.is_static[:, None]
         if not weight.any():
             nothing = np.zeros_like(cells.depth)
-            return DenseWorld(poses.astype(np.float64), 1.0, cells.depth, nothing, _ERRORS[0], 0.0, 0.0)
+            return DenseWorld(poses.astype(np.float64), 1.0, cells.depth, nothing, 0.0, _ERRORS[0], 0.0, 0.0)
         arrays = (depth, cameras, found.position, weight, cells.depth, np.float32(each.sigma))
         made = jax.tree.map(np.asarray, _adjust(*arrays, cells.grid, priors))
         poses, depth, factor = made.camera_from_world, made.depth, factor * float(made.focal)
         with np.errstate(over="ignore"):
             measured = np.clip(depth * np.exp(made.pull), *_DEPTHS)
+        matched = float((weight.sum(axis=1) > _LEAST_WEIGHT).mean())
         error = _error(cells.depth, measured, made.information)
         parallax = _parallax(depth, Cameras(poses, zoomed(K, factor)), cells.grid)
         zoom = _zoom(found.position, weight, made.position, each.sigma, cells.grid)
-        world = DenseWorld(poses.astype(np.float64), factor, measured, made.information, error, parallax, zoom)
+        world = DenseWorld(poses.astype(np.float64), factor, measured, made.information, matched, error, parallax, zoom)
         on_round()
     assert world is not None
     return world
