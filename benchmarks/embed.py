@@ -24,6 +24,7 @@ from vggtjax.pipeline.pretrained.load import load_model
 from vggtjax.research.evaluation.ladder import ladder
 from vggtjax.storage.writing import writing
 from vggtjax.training.scenes import SceneConfig
+from vggtjax.training.scenes.held_out import MOVERS
 
 MOST_MODEL_BYTES = 24 << 20
 MOST_CLIP_BYTES = 1 << 20
@@ -54,20 +55,28 @@ def embed(
         image_size: side in pixels that the model was last trained at, which becomes its own and the clip's; the
             model's own by default.
         height: of the clip in pixels, a multiple of the model's patch size; `image_size` by default.
-        assets: folder of textures, photographs and objects: the clip is a world of its test split instead of a room.
+        assets: folder of textures, photographs and objects: the clip is a world of its test split instead of a room,
+            one without sky in which as much moves as in rooms.
     """
     loaded = load_model(model)
     side = image_size or loaded.config.image_size
+    high, patch = side if height is None else height, loaded.config.patch_size
+    if not 0 < high <= side or high % patch:
+        raise InputError(f"height is {high}; expected a multiple of the patch size {patch}, at most {side}")
+    config = SceneConfig(height=high, width=side, frames=frames, samples=3)
+    truth = held_out_truth("dynamic", scenes, config, seed=SCENE_SEED, assets=assets)
+    if assets is not None:  # rooms are chosen when they are drawn
+        truth = _fit_to_show(truth)
     network = dataclasses.replace(loaded.config, image_size=side)
     params = {**loaded.params, "backbone": _at_size(loaded.params["backbone"], loaded.config, network)}
     params = jax.tree.map(lambda leaf: np.asarray(leaf).astype(numpy_dtype("bfloat16")), params)
     save_model(MODEL, params, network, name="demo", note=NOTE, untrained_heads=UNTRAINED_HEADS)
-    config = SceneConfig(height=height or side, width=side, frames=frames, samples=3)
-    truth = held_out_truth("dynamic", scenes, config, seed=SCENE_SEED, assets=assets)
     scene = _typical_scene(demo_model(), truth)
     write_demo_clip(CLIP, Truth(*(array[scene] for array in truth)))
     console = Console()
-    console.print(f"scene {scene} of {scenes} has typical errors of the cameras, and a typical change of them")
+    console.print(
+        f"scene {scene} of {len(truth.depth)} has typical errors of the cameras, and a typical change of them"
+    )
     for path, most in ((MODEL, MOST_MODEL_BYTES), (CLIP, MOST_CLIP_BYTES)):
         size = path.stat().st_size
         if size > most:
@@ -89,6 +98,15 @@ def write_demo_clip(path: Path, truth: Truth) -> None:
     )
     with writing(path) as temporary:
         temporary.write_bytes(content.getvalue())
+
+
+def _fit_to_show(truth: Truth) -> Truth:
+    """Return the clips whose depth is known everywhere, and in which as much moves as in held-out rooms."""
+    moving = truth.dynamic_mask.mean(axis=(1, 2, 3))
+    fit = (truth.depth > 0).all(axis=(1, 2, 3)) & (moving >= MOVERS[0]) & (moving <= MOVERS[1])
+    if not fit.any():
+        raise InputError(f"none of {len(fit)} scenes has things that move and no sky; ask for more scenes")
+    return Truth(*(array[fit] for array in truth))
 
 
 def _typical_scene(model: Model, truth: Truth) -> int:

@@ -97,7 +97,7 @@ def test_embed(run, tiny, tmp_path, monkeypatch):
     assert f"{(tmp_path / 'CLIP').stat().st_size} bytes" in shown
     assert demo_clip(tmp_path / "CLIP").images.shape == (3, 2 * SIDE, 2 * SIDE, 3)
     folder = write_assets(tmp_path / "assets")
-    run("embed", tiny, "--scenes", 3, "--frames", 3, "--image-size", 2 * SIDE, "--height", SIDE, "--assets", folder)
+    run("embed", tiny, "--scenes", 9, "--frames", 3, "--image-size", 2 * SIDE, "--height", SIDE, "--assets", folder)
     assert demo_clip(tmp_path / "CLIP").images.shape == (3, SIDE, 2 * SIDE, 3)
     assert embed._by_ranks(np.array([[3, 3], [1, 2], [2, 1.5]])).tolist() == [1, 2, 0]
 

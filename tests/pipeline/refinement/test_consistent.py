@@ -1,6 +1,7 @@
 """Consistent depth and the mask by pixels: painted rooms seen from known places, moving posters, and what stays."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -72,9 +73,26 @@ def test_depth_and_cameras_come_to_the_truth(corner, pictures, truth, predicted)
 
 
 def test_cameras_that_are_far_off_are_found(corner, pictures, truth):
-    turned = corner_result(corner, degrees=20, share=0)
+    turned = corner_result(corner, degrees=25, share=0)
     made, _ = consistent_depth(turned, iter(pictures))
     assert errors(made, truth, corner)[1] < 0.02 * errors(turned, truth, corner)[1]
+
+
+def test_a_narrow_clip_has_no_coarse_matches_but_fine_ones(corner, pictures):
+    predicted = corner_result(corner, degrees=2, share=0)
+    rows, frames = slice(19, 29), len(pictures)
+    names = ("images", "depth", "depth_confidence", "dynamic_mask")
+    fields: dict[str, Any] = {name: getattr(predicted, name)[:, rows] for name in names}
+    fields |= {
+        "intrinsics": predicted.intrinsics - np.array([[0, 0, 0], [0, 0, 19], [0, 0, 0]], np.float32),
+        "source_size": np.tile(np.array([10 * SCALE, WIDTH], predicted.source_size.dtype), (frames, 1)),
+        "valid_box": np.tile(np.array([0, 0, WIDTH // SCALE, 10], predicted.valid_box.dtype), (frames, 1)),
+    }
+    strip = dataclasses.replace(predicted, **fields)
+    made, report = consistent_depth(strip, iter(pictures[:, 19 * SCALE : 29 * SCALE]), join=False)
+    assert report.changed
+    turned = [rotation_error(each.camera_from_world, corner.camera_from_world) for each in (predicted, made)]
+    assert turned[1] < 0.5 * turned[0]
 
 
 def test_a_camera_that_stands_gets_one_place_and_keeps_its_depth(predicted, pictures, truth):
@@ -87,6 +105,7 @@ def test_a_camera_that_stands_gets_one_place_and_keeps_its_depth(predicted, pict
     first = np.repeat(made.camera_from_world[:1], len(still), axis=0)
     assert rotation_error(made.camera_from_world, first) < 0.1
     np.testing.assert_allclose(made.camera_from_world, first, atol=0.01 * np.median(predicted.depth))
+    np.testing.assert_allclose(made.intrinsics[:, 0, 0], np.median(predicted.intrinsics[:, 0, 0]), rtol=1e-5)
 
 
 def test_its_own_small_pictures_are_enough_to_get_better(corner, pictures, truth, predicted):

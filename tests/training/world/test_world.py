@@ -15,7 +15,7 @@ from vggtjax.training.world.config import Cameras, Movers, Places, WorldConfig
 from vggtjax.training.world.meshes import Surface, box, join, pillar
 from vggtjax.training.world.motion import STEPS, Actor
 from vggtjax.training.world.places import make_place
-from vggtjax.training.world.sampling import draw_camera
+from vggtjax.training.world.sampling import draw_actors, draw_camera
 
 SIZE = {"frames": 4, "height": 32, "width": 48, "patch": 4}
 SHARP = WorldConfig(blur=0, rolling=0, compression=0, noise=0, flicker=0)
@@ -167,7 +167,7 @@ def test_rows_out_of_range_are_refused(values):
 
 
 def test_tables_are_where_they_are_said_to_be_and_filmed_from_above(assets):
-    generator, tops = np.random.default_rng(4), 0
+    generator, tops, bare = np.random.default_rng(4), 0, 0
     film = {share: dataclasses.replace(SHARP, tabletop=share) for share in (0.0, 1.0)}
     down: dict[float, list[float]] = {0.0: [], 1.0: []}
     for _ in range(12):
@@ -179,12 +179,29 @@ def test_tables_are_where_they_are_said_to_be_and_filmed_from_above(assets):
             above = np.add(top.point(generator), [0, 0, 0.6]).astype(np.float32)
             below = moment.cast(above[None], np.array([[0, 0, -1]], np.float32)).distance[0]
             assert below < 0.6 + 1e-3, "a ray from above meets the top or what stands on it"
-            tops += 1
+            tops, bare = tops + 1, bare + (below > 0.6 - 1e-3)
         for share, config in film.items():
             rotation = draw_camera(generator, place, [], config, 1.0).path.pose(0.5)[0]
             down[share].append(-rotation[2, 2])
     assert tops > 10
+    assert bare > 0.5 * tops
     assert np.mean(down[1.0]) > np.mean(down[0.0]) + 0.1
+
+
+def test_things_move_over_tables_and_stay_there(assets):
+    generator, config, over = np.random.default_rng(5), WorldConfig(tabletop=1.0, movers=Movers(0, 0, 1, 0)), 0
+    for _ in range(12):
+        place = make_place(generator, assets, "room", 1.5)
+        for actor in draw_actors(generator, assets, place, config, 4.0) if place.tops else []:
+            shares = [
+                np.abs(
+                    (actor.place - top.middle) @ np.stack([axis / (axis @ axis) for axis in (top.along, top.across)]).T
+                )
+                for top in place.tops
+            ]
+            assert any((share < 1.001).all() for share in shares)
+            over += 1
+    assert over > 5
 
 
 def test_boxes_are_closed():

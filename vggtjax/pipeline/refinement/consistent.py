@@ -34,6 +34,7 @@ FEWEST_FRAMES, MOST_FRAMES = 3, 512
 _FEWEST_MATCHED = 0.05  # share of the cells whose depth is known from matches
 _KNOWN = 4.0  # a deviation of a log depth of 0.5 is the largest that is known
 _LEAST_PARALLAX = 0.3  # cells; with less, a wrong lens or shutter says more than depth does
+_LEAST_TURN = 1.0  # degrees; cameras that turn less say nothing of the focal length
 _MOST_ZOOM = 3e-5  # a frame; with more, a single focal length spoils depth
 _MOST_WORSE = 1.6  # factor by which frames may differ more after the field, before they are joined
 _MOST_TURNED = 0.3  # degrees by which pixels may turn bundle-adjusted cameras
@@ -130,6 +131,8 @@ def consistent_depth(
     known = world.information > _KNOWN
     zooms = priors.focal is not None and abs(world.zoom) > _MOST_ZOOM
     stands = known.mean() < _FEWEST_MATCHED or world.parallax < _LEAST_PARALLAX
+    if stands and _turn(world) < _LEAST_TURN:
+        world = world._replace(focal=1.0)  # nothing tells it
     by_cameras, made, change = _with_cameras(start, world), None, 0.0
     before = after = differences(result, step)
     if not zooms and not stands:
@@ -144,7 +147,7 @@ def consistent_depth(
     if made is None:  # cameras alone
         made, change, points = by_cameras, 0.0, None
         after = differences(made)
-        if not _agree(before, after, 1.0):
+        if not _agree(before, after, _MOST_WORSE if stands else 1.0):  # pixels know best where a camera stands
             return _kept(result, "no depth was found by which the frames agree better")
     share = 0.0
     if join:
@@ -183,6 +186,12 @@ def _turned(result: Result, world: DenseWorld) -> float:
         for x in (result.camera_from_world, world.camera_from_world)
     )
     return float(np.degrees((after * before.inv()).magnitude().mean()))
+
+
+def _turn(world: DenseWorld) -> float:
+    """Return by how many degrees the cameras are turned from the first, at most."""
+    turns = scipy.spatial.transform.Rotation.from_matrix(world.camera_from_world[:, :, :3])
+    return float(np.degrees((turns * turns[0].inv()).magnitude().max()))
 
 
 def _with_cameras(result: AnyResult, world: DenseWorld) -> AnyResult:

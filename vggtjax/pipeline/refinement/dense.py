@@ -37,7 +37,7 @@ class Round(NamedTuple):
 
 ROUNDS = (
     Round(1, Window(3, 12), 2.0),  # predicted cameras can be off by half a picture
-    Round(2, Window(4, 10), 2.0),
+    Round(2, Window(4, 8), 2.0),
     Round(2, Window(4, 6), 1.0),
     Round(4, Window(4, 4), 0.4),
     Round(8, Window(4, 4), 0.16),
@@ -112,16 +112,20 @@ def adjust_to_pixels(
         on_round: called after each.
     """
     poses, K = cells.cameras.camera_from_world.astype(np.float32), cells.cameras.intrinsics.astype(np.float32)
-    depth, factor, world = cells.depth, 1.0, None
+    depth, factor = cells.depth, 1.0
+    nothing = world = DenseWorld(
+        poses.astype(np.float64), 1.0, depth, np.zeros_like(depth), 0.0, _ERRORS[0], parallax=0.0, zoom=0.0
+    )
     for each in rounds:
         cameras = Cameras(poses, zoomed(K, factor))
         expected, warp = expected_matches(depth, cameras, cells.grid)
         pictures = at_scale(grey, cells.grid, each.pixels)
         found = match_pixels(pictures, expected, warp, cells.grid, each.window)
         weight = found.weight * cells.is_static[:, None]
-        if not weight.any():
-            nothing = np.zeros_like(cells.depth)
-            return DenseWorld(poses.astype(np.float64), 1.0, cells.depth, nothing, 0.0, _ERRORS[0], 0.0, 0.0)
+        if not weight.any():  # such as windows that are larger than the coarse pictures of a narrow clip
+            world = nothing
+            on_round()
+            continue
         arrays = (depth, cameras, found.position, weight, cells.depth, np.float32(each.sigma))
         made = jax.tree.map(np.asarray, _adjust(*arrays, cells.grid, priors))
         poses, depth, factor = made.camera_from_world, made.depth, factor * float(made.focal)
@@ -133,7 +137,6 @@ def adjust_to_pixels(
         zoom = _zoom(found.position, weight, made.position, each.sigma, cells.grid)
         world = DenseWorld(poses.astype(np.float64), factor, measured, made.information, matched, error, parallax, zoom)
         on_round()
-    assert world is not None
     return world
 
 

@@ -51,8 +51,8 @@ class WorldConfig:
     Attributes:
         places, cameras, movers: weights of the kinds.
         dynamic: share of clips in which one to four things move.
-        tabletop: share of the clips of rooms with tables that film the top of one, and of their rigid movers that move
-            over one.
+        tabletop: share of the cameras in rooms with tables that film the top of one, of those that film no mover; and
+            of the rigid movers there that move over one.
         clutter: factor of the number of things at rest, in [0, 4].
         seconds: range of the length of a clip; frames are at equal steps.
         motion: factor of what the camera travels and turns, in [0, 4].

@@ -146,7 +146,7 @@ def _thing(generator: np.random.Generator, assets: Assets, place: Place, config:
     speed = np.exp(generator.uniform(np.log(0.05), np.log(0.6 if top else 3)))
     path, turn = _on_ground(generator, place, seconds, speed, generator.normal(0, 1.0), driven=False)
     if top:
-        path = path - path[STEPS // 2] + top.point(generator)
+        path = top.within(path - path[STEPS // 2] + top.point(generator))
     if generator.random() < 0.6:
         hop = np.abs(wander(generator, generator.uniform(0.05, 0.6), seconds, 0.3, 1.2, 1))
         path = path + (generator.uniform(0.2, 1.2) + hop) * [0, 0, 0.3 if top else 1]

@@ -57,6 +57,7 @@ def surface(generator: np.random.Generator, assets: Assets, row: str, low: float
 
 
 def still_shapes(assets: Assets) -> list[Shape]:
+    """Return the shapes without a gait."""
     return [shape for shape in assets.shapes.values() if not shape.rate]
 
 

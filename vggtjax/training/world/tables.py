@@ -13,6 +13,7 @@ from vggtjax.training.world.stock import pick, standing, still_shapes, surface, 
 
 _ON_TOP = 0.45  # metres: largest extent of a shape that stands on a table
 _LEG = 0.05  # metres
+_SEAT = 0.57  # metres: the highest seat
 
 
 class Top(NamedTuple):
@@ -27,6 +28,12 @@ class Top(NamedTuple):
         a, b = generator.uniform(-0.65, 0.65, 2)  # within a round one, too
         return self.middle + a * self.along + b * self.across
 
+    def within(self, path: np.ndarray) -> np.ndarray:
+        """Return a path [N, 3] held over the top."""
+        axes = np.stack([self.along, self.across])
+        shares = (path - self.middle) @ (axes / (axes**2).sum(axis=1, keepdims=True)).T
+        return self.middle + np.clip(shares, -1, 1) @ axes
+
 
 def table(generator: np.random.Generator, assets: Assets, at, heading: float) -> tuple[list[Mesh], Top]:
     """Return a table on legs, on a foot or round, the things on it and chairs at it."""
@@ -34,15 +41,16 @@ def table(generator: np.random.Generator, assets: Assets, at, heading: float) ->
     tall, thick = generator.uniform(0.4, 0.95), generator.uniform(0.02, 0.08)
     look, dark = _plain(generator, assets), _plain(generator, assets)
     half, legs = np.array([long, deep]) / 2, tall - thick
-    if generator.random() < 0.2:  # round
+    is_round, stands_on_legs = generator.random() < 0.2, generator.random() < 0.8
+    if is_round:
         half = np.full(2, min(half))
         made = [_at(pillar(half[0], thick, look), [0, 0, legs]), pillar(0.06, legs, dark)]
-    elif generator.random() < 0.8:
+    elif stands_on_legs:
         made = [_at(box([long, deep, thick], look), [0, 0, legs]), *_legs(half, legs, dark)]
     else:
         made = [box([long, deep, tall], look)]
-    made += _things(generator, assets, half, tall)
-    for _ in range(int(generator.integers(0, 5))):
+    made += _things(generator, assets, half, tall, 0.65 if is_round else 0.85)
+    for _ in range(int(generator.integers(0, 5)) if stands_on_legs and tall > _SEAT else 0):
         side, share = generator.choice([-1, 1]), generator.uniform(-0.8, 0.8)
         place = np.array([share * half[0], side * (half[1] + generator.uniform(-0.1, 0.35)), 0])
         turn = np.pi * (side < 0) + generator.normal(0, 0.25)
@@ -94,11 +102,11 @@ def _chair(generator: np.random.Generator, look: Surface) -> list[Mesh]:
     return [*made, _at(box([wide, 0.04, back], look), [0, wide / 2, seat])]
 
 
-def _things(generator: np.random.Generator, assets: Assets, half, tall: float) -> list[Mesh]:
-    """Return things on a top of half axes `half` at a height."""
+def _things(generator: np.random.Generator, assets: Assets, half, tall: float, share: float = 0.85) -> list[Mesh]:
+    """Return things on a top of half axes `half` at a height, with their middles in a share of it."""
     made, shapes = [], [shape for shape in still_shapes(assets) if max(shape.extent) < _ON_TOP]
     for _ in range(int(generator.integers(0, 12))):
-        x, y = generator.uniform(-0.85, 0.85, 2) * half
+        x, y = generator.uniform(-share, share, 2) * half
         heading, draw = generator.uniform(0, 2 * np.pi), generator.random()
         if draw < 0.25 and shapes:
             made.append(standing(pick(generator, shapes), x, y, tall, heading, tint(generator, 0.12)))
