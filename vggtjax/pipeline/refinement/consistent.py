@@ -49,9 +49,7 @@ class ConsistencyReport:
 
     changed: bool
     reason: str = ""  # why depth and cameras stayed
-    cells: float = (
-        0.0  # share of the frames' cells whose depth matched pixels tell; that match, if cameras change alone
-    )
+    cells: float = 0.0  # share of the cells whose depth matched pixels tell; that match, if cameras change alone
     points: int = 0  # observations of bundle-adjusted points
     change: float = 0.0  # mean |log| by which depth changed
     layers_before: float = 0.0  # median |log| between the depths of frames that see one place
@@ -131,7 +129,7 @@ def consistent_depth(
     known = world.information > _KNOWN
     zooms = priors.focal is not None and abs(world.zoom) > _MOST_ZOOM
     stands = known.mean() < _FEWEST_MATCHED or world.parallax < _LEAST_PARALLAX
-    if stands and _turn(world) < _LEAST_TURN:
+    if stands and _sweep(world) < _LEAST_TURN:
         world = world._replace(focal=1.0)  # nothing tells it
     by_cameras, made, change = _with_cameras(start, world), None, 0.0
     before = after = differences(result, step)
@@ -188,8 +186,8 @@ def _turned(result: Result, world: DenseWorld) -> float:
     return float(np.degrees((after * before.inv()).magnitude().mean()))
 
 
-def _turn(world: DenseWorld) -> float:
-    """Return by how many degrees the cameras are turned from the first, at most."""
+def _sweep(world: DenseWorld) -> float:
+    """Return the largest angle between the first camera and another, in degrees."""
     turns = scipy.spatial.transform.Rotation.from_matrix(world.camera_from_world[:, :, :3])
     return float(np.degrees((turns * turns[0].inv()).magnitude().max()))
 
