@@ -26,12 +26,12 @@ from vggtjax.pipeline.refinement.cells import Cells, cells_of, grey_pictures
 from vggtjax.pipeline.refinement.dense import PREDICTED, ROUNDS, CameraPriors, DenseWorld, adjust_to_pixels
 from vggtjax.pipeline.refinement.field import FieldPrior, Measured, at_pixels, fit_field
 from vggtjax.pipeline.refinement.joining import differences, join_frame, tolerance_of
+from vggtjax.pipeline.refinement.pixel_matches import FEWEST_MATCHED
 from vggtjax.progress import Progress, no_progress
 from vggtjax.results.result import AnyResult, Result
 from vggtjax.storage.arrays import zeros_beside
 
 FEWEST_FRAMES, MOST_FRAMES = 3, 512
-_FEWEST_MATCHED = 0.05  # share of the cells whose depth is known from matches
 _KNOWN = 4.0  # a deviation of a log depth of 0.5 is the largest that is known
 _LEAST_PARALLAX = 0.3  # cells; with less, a wrong lens or shutter says more than depth does
 _LEAST_TURN = 1.0  # degrees; cameras that turn less say nothing of the focal length
@@ -115,20 +115,20 @@ def consistent_depth(
     if priors.focal is not None:  # one focal length: errors of single ones would hold other cameras in wrong places
         start = dataclasses.replace(result, intrinsics=shared_focal(result).astype(np.float32))
     cells = cells_of(start)
-    if (share := cells.is_static.mean()) < _FEWEST_MATCHED:
+    if (share := cells.is_static.mean()) < FEWEST_MATCHED:
         return _kept(
-            result, f"{share:.1%} of the picture shows what does not move; at least {_FEWEST_MATCHED:.0%} is needed"
+            result, f"{share:.1%} of the picture shows what does not move; at least {FEWEST_MATCHED:.0%} is needed"
         )
     grey = grey_pictures(result, pictures, cells.grid)
     world = adjust_to_pixels(cells, grey, priors, on_round=step)
     if points is not None and _turned(start, world) > _MOST_TURNED:
         points = None  # the bundle adjustment ended in a wrong place
-    if world.matched < _FEWEST_MATCHED or not np.isfinite(world.camera_from_world).all():
+    if world.matched < FEWEST_MATCHED or not np.isfinite(world.camera_from_world).all():
         share = f"{world.matched:.1%} of the picture matches other frames"
-        return _kept(result, f"{share}; at least {_FEWEST_MATCHED:.0%} is needed (texture)")
+        return _kept(result, f"{share}; at least {FEWEST_MATCHED:.0%} is needed (texture)")
     known = world.information > _KNOWN
     zooms = priors.focal is not None and abs(world.zoom) > _MOST_ZOOM
-    stands = known.mean() < _FEWEST_MATCHED or world.parallax < _LEAST_PARALLAX
+    stands = known.mean() < FEWEST_MATCHED or world.parallax < _LEAST_PARALLAX
     if stands and _sweep(world) < _LEAST_TURN:
         world = world._replace(focal=1.0)  # nothing tells it
     by_cameras, made, change = _with_cameras(start, world), None, 0.0

@@ -15,12 +15,11 @@ from vggtjax.cameras import Cameras, zoomed
 from vggtjax.method.matching.adjustment import Adjustment, Static, adjust
 from vggtjax.method.matching.matches import frame_pairs
 from vggtjax.pipeline.refinement.cells import Cells, at_scale
-from vggtjax.pipeline.refinement.pixel_matches import Window, expected_matches, match_pixels
+from vggtjax.pipeline.refinement.pixel_matches import LEAST_WEIGHT, Window, expected_matches, match_pixels
 
 _ANNEALED = (4.0, 3.0, 2.0, 1.5, 1.0, 1.0, 1.0, 1.0)
 _DEPTH_PRIOR = 0.6  # standard deviation of a log depth from the network's, in the rounds
 _DAMPING = 1e-5
-_LEAST_WEIGHT = 0.2  # sum of the weights of a cell's matches, from which it counts as matched
 _SURE = 0.1  # deviation of a measured log depth, up to which it tells the network's error
 _FEWEST_SURE = 20
 _DEPTHS = (1e-6, 1e6)  # range of a measured depth
@@ -131,7 +130,7 @@ def adjust_to_pixels(
         poses, depth, factor = made.camera_from_world, made.depth, factor * float(made.focal)
         with np.errstate(over="ignore"):
             measured = np.clip(depth * np.exp(made.pull), *_DEPTHS)
-        matched = float((weight.sum(axis=1) > _LEAST_WEIGHT).mean())
+        matched = float((weight.sum(axis=1) > LEAST_WEIGHT).mean())
         error = _error(cells.depth, measured, made.information)
         parallax = _parallax(depth, Cameras(poses, zoomed(K, factor)), cells.grid)
         zoom = _zoom(found.position, weight, made.position, each.sigma, cells.grid)

@@ -19,7 +19,14 @@ from vggtjax.method.matching.matches import frame_pairs
 from vggtjax.network.surroundings import own_settings
 from vggtjax.pipeline.refinement.cells import Cells, at_scale, cells_of, grey_pictures
 from vggtjax.pipeline.refinement.consistent import FEWEST_FRAMES, MOST_FRAMES
-from vggtjax.pipeline.refinement.pixel_matches import PixelMatches, Window, expected_matches, match_pixels
+from vggtjax.pipeline.refinement.pixel_matches import (
+    FEWEST_MATCHED,
+    LEAST_WEIGHT,
+    PixelMatches,
+    Window,
+    expected_matches,
+    match_pixels,
+)
 from vggtjax.results.result import AnyResult, Result, mask_is_mined
 
 SOURCE = "mined: matched pixels and Gram similarities"
@@ -28,11 +35,9 @@ _SMALLEST_SCALE = 0.2  # cells; smaller differences are no motion
 _LARGEST = 8.0  # differences beyond this many scales count as this
 _SURE = 0.1  # weight from which a match tells the scale
 _LEAST_MOTION = 1e-3  # by matches
-_LEAST = 0.2  # sum of the weights of a cell's matches, from which they tell its motion
 _SPECK = 0.25  # of a patch's pixels: smaller regions and holes of the mask are noise
 _OFFSET, _FLOOR = 0.25, 0.1  # score = log(difference + offset) + log(Gram + floor)
 _TIMES_MEDIAN_ALONE = 4.0  # least motion without matches of the network; the score is then twice as wide
-_FEWEST_MATCHED = 0.05  # share of the cells
 
 
 def takes_pixel_mask(result: Result) -> bool:
@@ -104,7 +109,7 @@ def pixel_motion(
     expected, warp = expected_matches(cells.depth, cells.cameras, grid)
     found = match_pixels(at_scale(grey, grid, _PIXELS), expected, warp, grid, _WINDOW)
     gram = _resized(saliency, grid, Image.Resampling.BILINEAR).reshape(S, -1)
-    if (found.weight.sum(axis=1) > _LEAST).mean() < _FEWEST_MATCHED:
+    if (found.weight.sum(axis=1) > LEAST_WEIGHT).mean() < FEWEST_MATCHED:
         return None
     score = np.log(_difference(expected, found) + _OFFSET) + np.log(gram.clip(0, 1) + _FLOOR)
     if motion is not None:
@@ -120,8 +125,8 @@ def _difference(expected: Float32[np.ndarray, "S M P 2"], found: PixelMatches) -
     sure = distance[weight > _SURE]
     scale = max(float(np.median(sure)) if len(sure) else 0.0, _SMALLEST_SCALE)
     total = weight.sum(axis=1)
-    mean = np.sum(weight * np.minimum(distance / scale, _LARGEST), axis=1) / np.maximum(total, _LEAST)
-    return np.where(total > _LEAST, mean, np.median(mean))
+    mean = np.sum(weight * np.minimum(distance / scale, _LARGEST), axis=1) / np.maximum(total, LEAST_WEIGHT)
+    return np.where(total > LEAST_WEIGHT, mean, np.median(mean))
 
 
 def _without_specks(mask: Bool[np.ndarray, "H W"], least: float) -> Bool[np.ndarray, "H W"]:

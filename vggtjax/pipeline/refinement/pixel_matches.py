@@ -35,6 +35,10 @@ class Window(NamedTuple):
     reach: int
 
 
+LEAST_WEIGHT = 0.2  # sum of the weights of a patch's matches, from which they count
+FEWEST_MATCHED = 0.05  # share of the patches that must have matches that count
+
+
 class PixelMatches(NamedTuple):
     """Matches of every patch with frames at M offsets."""
 
