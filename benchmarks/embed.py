@@ -86,7 +86,7 @@ def embed(
 
 def write_demo_clip(path: Path, truth: Truth) -> None:
     """Write a clip for `demo_clip`: colours in 8 bits, depth in 16 bits, the mask in 1 bit."""
-    steps = np.log(np.maximum(truth.depth, NEAREST) / NEAREST) / STEP  # 0 where depth is not known
+    steps = np.log(np.maximum(truth.depth, NEAREST) / NEAREST) / STEP
     content = io.BytesIO()
     np.savez_compressed(
         content,

@@ -36,8 +36,7 @@ def demo_clip(path: Path = CLIP) -> Truth:
     if not path.is_file():
         raise ClipError(f"the embedded clip {path} is missing; install vggtjax again")
     with np.load(path, allow_pickle=False) as stored:
-        steps = stored["log_depth"].astype(np.float32)
-        depth = np.where(steps > 0, NEAREST * np.exp(steps * np.float32(STEP)), np.float32(0))
+        depth = NEAREST * np.exp(stored["log_depth"].astype(np.float32) * np.float32(STEP))
         mask = np.unpackbits(stored["dynamic_mask"], count=depth.size).astype(bool).reshape(depth.shape)
         images = stored["images"].astype(np.float32) / 255
         return Truth(images, depth, mask, stored["camera_from_world"], stored["intrinsics"])

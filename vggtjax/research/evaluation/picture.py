@@ -29,8 +29,8 @@ def truth_sheet(
     """
     S, H, W = result.depth.shape
     shown = np.linspace(0, S - 1, min(S, _FRAMES)).round().astype(int)
-    true_depth = np.asarray(truth.depth, np.float32)
-    inverse_range = inverse_depth_range(true_depth, true_depth > 0)
+    true_depth, everywhere = np.asarray(truth.depth, np.float32), np.ones((H, W), bool)
+    inverse_range = inverse_depth_range(true_depth, np.ones((S, H, W), bool))
     depths = {} if predicted is None else {"Depth predicted": predicted.depth}
     depths |= {"Depth found": result.depth, "Depth true": true_depth}
     masks = {"Moving found": result.dynamic_mask} if result.has_mask else {}
@@ -38,7 +38,7 @@ def truth_sheet(
     rows = [Row("Picture", [*result.images[shown]])]
     for label, depth in depths.items():
         scaled = (depth * median_scale(depth, true_depth)).astype(np.float32)[shown]
-        rows.append(Row(label, [color_depth(frame, frame > 0, inverse_range) for frame in scaled]))
+        rows.append(Row(label, [color_depth(frame, everywhere, inverse_range) for frame in scaled]))
     rows += [Row(name, [overlay(result.images[i], mask[i]) for i in shown]) for name, mask in masks.items()]
     title = f"{result.method}  ·  {result.model_name}  ·  against the truth"
     sheet = draw_grid(title, [f"frame {frame}" for frame in shown], rows, fitted((H, W), (_SIDE, 2 * _SIDE)))
