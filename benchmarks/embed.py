@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import io
+from collections.abc import Sequence
 from pathlib import Path
 
 import jax
@@ -17,11 +18,21 @@ from vggtjax.clips.truth import Truth
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.network.backbone import patch_positions
-from vggtjax.network.checkpoint import Model, numpy_dtype, save_model
+from vggtjax.network.checkpoint import numpy_dtype, save_model
 from vggtjax.network.layers import Params
-from vggtjax.pipeline.pretrained.embedded import CLIP, MODEL, NEAREST, NOTE, STEP, UNTRAINED_HEADS, demo_model
+from vggtjax.pipeline.pretrained.embedded import (
+    CLIP,
+    MODEL,
+    NEAREST,
+    NOTE,
+    SECOND_PASS,
+    STEP,
+    UNTRAINED_HEADS,
+    demo_model,
+)
 from vggtjax.pipeline.pretrained.load import load_model
-from vggtjax.research.evaluation.ladder import ladder
+from vggtjax.research.evaluation.ladder import LadderRow, ladder
+from vggtjax.research.evaluation.ladder_words import second_pass_over, write_second_pass
 from vggtjax.storage.writing import writing
 from vggtjax.training.scenes import SceneConfig
 from vggtjax.training.scenes.held_out import MOVERS
@@ -41,7 +52,7 @@ def embed(
     height: int | None = None,
     assets: Path | None = None,
 ) -> None:
-    """Write the model, in bfloat16, and a held-out dynamic clip into the package.
+    """Write the model, in bfloat16, a held-out dynamic clip, and what the second pass changes over such clips.
 
     The clip is a typical one of `scenes`. Scenes are ranked by the rotation error and by the centres' error of the
     first pass, and the middle third by the sum of ranks is kept. These are ranked by how the second pass, with mined
@@ -71,7 +82,9 @@ def embed(
     params = {**loaded.params, "backbone": _at_size(loaded.params["backbone"], loaded.config, network)}
     params = jax.tree.map(lambda leaf: np.asarray(leaf).astype(numpy_dtype("bfloat16")), params)
     save_model(MODEL, params, network, name="demo", note=NOTE, untrained_heads=UNTRAINED_HEADS)
-    scene = _typical_scene(demo_model(), truth)
+    rows = ladder(demo_model(), truth, methods=("vggt", "4dvggt-d"), masks=("mined", "matches", "true"))
+    write_second_pass(SECOND_PASS, second_pass_over(rows))
+    scene = _typical_scene(rows)
     write_demo_clip(CLIP, Truth(*(array[scene] for array in truth)))
     console = Console()
     console.print(
@@ -109,12 +122,14 @@ def _fit_to_show(truth: Truth) -> Truth:
     return Truth(*(array[fit] for array in truth))
 
 
-def _typical_scene(model: Model, truth: Truth) -> int:
+def _typical_scene(rows: Sequence[LadderRow]) -> int:
     """Return the index of the median scene by change, of the middle third by the errors of the first pass."""
-    rows = ladder(model, truth, methods=("vggt", "4dvggt-d"), masks=("mined",))
     first, second = (
-        np.array([[row.rotation_error, row.centre_error_ratio] for row in rows if row.method == name], np.float64)
-        for name in ("vggt", "4dvggt-d")
+        np.array(
+            [[row.rotation_error, row.centre_error_ratio] for row in rows if (row.method, row.mask_source) == each],
+            np.float64,
+        )
+        for each in (("vggt", None), ("4dvggt-d", "mined"))
     )
     third = len(first) // 3
     middle = _by_ranks(first)[third : len(first) - third]

@@ -83,7 +83,11 @@ def test_the_wheel_works_outside_the_repository(wheel, tmp_path):
     tops = {name.split("/")[0] for name in names if not name.split("/")[0].endswith(".dist-info")}
     assert tops == {"vggtjax", "converters"}
     needed_files = ("__init__.pyi", "py.typed", "results/viewer/client/main.js")
-    needed_files += ("pipeline/pretrained/model.safetensors", "pipeline/pretrained/WEIGHTS-LICENSE.md")
+    needed_files += (
+        "pipeline/pretrained/model.safetensors",
+        "pipeline/pretrained/second_pass.json",
+        "pipeline/pretrained/WEIGHTS-LICENSE.md",
+    )
     assert {f"vggtjax/{name}" for name in needed_files} <= set(names)
     (entry_points,) = (tmp_path / "installed").glob("*.dist-info/entry_points.txt")
     assert "vggtjax = vggtjax.__main__:run" in entry_points.read_text()

@@ -14,6 +14,7 @@ from vggtjax.clips.truth import Truth
 from vggtjax.errors import InputError
 from vggtjax.network.checkpoint import read_model
 from vggtjax.pipeline.pretrained.embedded import demo_clip
+from vggtjax.research.evaluation.ladder_words import read_second_pass
 
 pytestmark = pytest.mark.filterwarnings("ignore:the field of view")
 
@@ -86,13 +87,14 @@ def test_a_clip_survives_the_file(tmp_path):
 
 
 def test_embed(run, tiny, tmp_path, monkeypatch):
-    for name in ("MODEL", "CLIP"):
+    for name in ("MODEL", "CLIP", "SECOND_PASS"):
         monkeypatch.setattr(embed, name, tmp_path / name)
     monkeypatch.setattr(embed, "demo_model", lambda: read_model(tmp_path / "MODEL"))
     shown = run("embed", tiny, "--scenes", 3, "--frames", 3, "--image-size", 2 * SIDE)
     model = read_model(tmp_path / "MODEL")
     assert (model.name, model.config.image_size) == ("demo", 2 * SIDE)
     assert f"{(tmp_path / 'CLIP').stat().st_size} bytes" in shown
+    assert read_second_pass(tmp_path / "SECOND_PASS").clips == 3
     assert demo_clip(tmp_path / "CLIP").images.shape == (3, 2 * SIDE, 2 * SIDE, 3)
     folder = write_assets(tmp_path / "assets")
     run("embed", tiny, "--scenes", 9, "--frames", 3, "--image-size", 2 * SIDE, "--height", SIDE, "--assets", folder)

@@ -44,7 +44,8 @@ def test_demo(tmp_path, capsys, monkeypatch):
     assert result.method == "4dvggt-m"
     is_matched = result.settings["masks"] in (SOURCE, "mined: matches between frames and Gram similarities")
     assert is_matched == (result.motion is not None)  # those of a tiny network need not come back
-    assert "Masks by matches: the second pass" in out
+    assert "Masks by matches, second pass on this clip: " in out
+    assert "such clips the second pass changes the mean errors" in out
     assert re.search(r"(?m)^consistent +(pixels|mined) ", out)
     assert "Depth and cameras fitted to the clip's pixels, compared with the first pass: rotation" in out
     assert result.settings["consistent_depth"] is True

@@ -73,9 +73,9 @@ def test_depth_and_cameras_come_to_the_truth(corner, pictures, truth, predicted)
 
 
 def test_cameras_that_are_far_off_are_found(corner, pictures, truth):
-    turned = corner_result(corner, degrees=25, share=0)
+    turned = corner_result(corner, degrees=90, share=0)
     made, _ = consistent_depth(turned, iter(pictures))
-    assert errors(made, truth, corner)[1] < 0.02 * errors(turned, truth, corner)[1]
+    assert errors(made, truth, corner)[1] < 0.2
 
 
 def test_a_narrow_clip_has_no_coarse_matches_but_fine_ones(corner, pictures):

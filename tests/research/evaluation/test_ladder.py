@@ -21,7 +21,15 @@ from vggtjax.network.checkpoint import Model
 from vggtjax.network.heads.pose import encode_pose
 from vggtjax.options import ABLATION
 from vggtjax.pipeline.fields import clip_fields
-from vggtjax.research.evaluation.ladder import LadderRow, error_table, ladder, score_result, second_pass_in_words
+from vggtjax.research.evaluation.ladder import LadderRow, ladder, score_result
+from vggtjax.research.evaluation.ladder_words import (
+    error_table,
+    many_in_words,
+    read_second_pass,
+    second_pass_in_words,
+    second_pass_over,
+    write_second_pass,
+)
 from vggtjax.research.evaluation.metrics.depth import depth_errors, median_scale
 from vggtjax.research.evaluation.metrics.masks import auc, jaccard
 from vggtjax.research.evaluation.metrics.trajectory import centre_error, rotation_error
@@ -199,8 +207,8 @@ def test_a_model_gone_wrong_is_a_row_that_says_so(model, truth):
 @pytest.mark.parametrize(
     ("rotation", "centre", "abs_rel", "expected"),
     [
-        (1.5, 0.01, 0.1, "steadies the cameras .rotation better, .*; centres better, 0.020 -> 0.010; AbsRel better"),
-        (2.5, 0.02, 0.3, "does not steady the cameras .rotation worse, 2.00° -> 2.50°; centres unchanged, .* worse"),
+        (1.5, 0.01, 0.1, "rotation better, .*; centres better, 0.020 -> 0.010; AbsRel better"),
+        (2.5, 0.02, 0.3, "rotation worse, 2.00° -> 2.50°; centres unchanged, .* worse"),
     ],
 )
 def test_words_follow_the_numbers(rows, rotation, centre, abs_rel, expected):
@@ -208,6 +216,27 @@ def test_words_follow_the_numbers(rows, rotation, centre, abs_rel, expected):
     second = replace(first, method="4dvggt-d", mask_source="mined", abs_rel=abs_rel)
     second = replace(second, rotation_error=rotation, centre_error_ratio=centre)
     words = second_pass_in_words([first, second])
-    assert re.match(f"Masks as in the paper: the second pass {expected}", words)
+    assert re.match(f"Masks as in the paper, second pass on this clip: {expected}", words)
     assert second_pass_in_words([first]) == second_pass_in_words([first, replace(second, abs_rel=None)]) == ""
     assert error_table([first, second]).note.startswith(words)
+
+
+def test_changes_over_clips_are_shares_of_the_first_pass(rows, tmp_path):
+    plain = replace(only(rows, clip=0, method="vggt"), centre_error_ratio=0.02)
+    first = [replace(plain, clip=clip, rotation_error=error) for clip, error in enumerate((1.0, 2.0, 3.0, 9.0))]
+    second = [
+        replace(row, method="4dvggt-d", mask_source="true", rotation_error=error)
+        for row, error in zip(first, (1.0, 1.0, 2.5, 1.0), strict=True)
+    ]
+    second[3] = replace(second[3], centre_error_ratio=None)  # such as a camera that stands: the clip does not count
+    many = second_pass_over([*second, *first])
+    assert many.clips == 3
+    assert list(many.changes) == ["true"]
+    change = many.changes["true"]["rotation_error"]  # differences of 0, -1 and -0.5 degrees over a mean of 2
+    assert change == pytest.approx((-0.25, 0.25 / 3**0.5))
+    write_second_pass(tmp_path / "file.json", many)
+    assert read_second_pass(tmp_path / "file.json") == many
+    assert many_in_words(many).startswith("Over 3 such clips")
+    assert many_in_words(many).endswith("True masks: rotation by -25 ± 14 %, centres by +0 ± 0 %.")
+    assert many_in_words(many) in error_table([first[0], second[0]], many=many).note
+    assert "centres unknown" in error_table([first[0]], second[3]).note

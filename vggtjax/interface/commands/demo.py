@@ -47,11 +47,13 @@ def demo(*, out: Path = Path("demo-output"), method: MethodName = "4dvggt-m", vi
         result = agree_with_pixels(predicted, clip.pictures, CONSISTENT, on_stage=report.stage)
         predicted, result = without_mask(predicted), without_mask(result)
         with report.stage("measure") as progress:
-            from vggtjax.research.evaluation.ladder import error_table, ladder, score_result
+            from vggtjax.pipeline.pretrained.embedded import SECOND_PASS
+            from vggtjax.research.evaluation.ladder import ladder, score_result
+            from vggtjax.research.evaluation.ladder_words import error_table, read_second_pass
 
             rows = ladder(model, truth, masks=("mined", "matches", "true"), progress=progress)
             source = "mined" if result.motion is None else "pixels"
-            errors = error_table(rows, score_result(result, truth, source))
+            errors = error_table(rows, score_result(result, truth, source), read_second_pass(SECOND_PASS))
         with report.stage("write") as progress:
             from PIL import Image
 

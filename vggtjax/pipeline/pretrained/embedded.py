@@ -1,4 +1,4 @@
-"""Input of `vggtjax demo`: the embedded model, and the embedded clip with its truth. Both are files of the package."""
+"""Input of `vggtjax demo`, files of the package: a model, a clip with its truth, and a measurement."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from vggtjax.network.checkpoint import LoadedDType, Model, read_model
 
 MODEL = Path(__file__).with_name("model.safetensors")
 CLIP = MODEL.with_name("clip.npz")
+SECOND_PASS = MODEL.with_name("second_pass.json")  # what the second pass changes over many such clips
 NOTE = "small demonstration model, trained on generated scenes; not for real footage"
 UNTRAINED_HEADS = ("points", "tracks")
 NEAREST = np.float32(1e-3)  # metres

@@ -27,6 +27,7 @@ from vggtjax.pipeline.refinement.dense import PREDICTED, ROUNDS, CameraPriors, D
 from vggtjax.pipeline.refinement.field import FieldPrior, Measured, at_pixels, fit_field
 from vggtjax.pipeline.refinement.joining import differences, join_frame, tolerance_of
 from vggtjax.pipeline.refinement.pixel_matches import FEWEST_MATCHED
+from vggtjax.pipeline.refinement.turns import turned_by_features
 from vggtjax.progress import Progress, no_progress
 from vggtjax.results.result import AnyResult, Result
 from vggtjax.storage.arrays import zeros_beside
@@ -101,7 +102,7 @@ def consistent_depth(
     Raises ClipError for pictures that are missing, or of another size than the result's.
     """
     frames, size = len(result.depth), (result.depth.shape[1], result.depth.shape[2])
-    total, done, tell = len(ROUNDS) + 5 * frames, count(), progress or no_progress
+    total, done, tell = len(ROUNDS) + 6 * frames, count(), progress or no_progress
 
     def step() -> None:
         tell(next(done), total)
@@ -120,7 +121,10 @@ def consistent_depth(
             result, f"{share:.1%} of the picture shows what does not move; at least {FEWEST_MATCHED:.0%} is needed"
         )
     grey = grey_pictures(result, pictures, cells.grid)
-    world = adjust_to_pixels(cells, grey, priors, on_round=step)
+    starts = []
+    if points is None and priors.rotation >= PREDICTED.rotation:  # neither bundle-adjusted nor known cameras
+        starts = [turned] if (turned := turned_by_features(cells, grey, on_frame=step)) is not None else []
+    world = adjust_to_pixels(cells, grey, priors, on_round=step, starts=starts)
     if points is not None and _turned(start, world) > _MOST_TURNED:
         points = None  # the bundle adjustment ended in a wrong place
     if world.matched < FEWEST_MATCHED or not np.isfinite(world.camera_from_world).all():

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -24,6 +24,7 @@ _SURE = 0.1  # deviation of a measured log depth, up to which it tells the netwo
 _FEWEST_SURE = 20
 _DEPTHS = (1e-6, 1e6)  # range of a measured depth
 _ERRORS = (0.03, 0.3)  # range of the network's error
+_CLEARLY = 1.02  # factor of the agreement by which further cameras must be better than the predicted ones
 
 
 class Round(NamedTuple):
@@ -100,6 +101,7 @@ def adjust_to_pixels(
     priors: CameraPriors,
     rounds: tuple[Round, ...] = ROUNDS,
     on_round: Callable[[], object] = lambda: None,
+    starts: Sequence[Float[np.ndarray, "S 3 4"]] = (),
 ) -> DenseWorld:
     """Return cameras and depths for which cells are seen where the pixels match.
 
@@ -109,34 +111,95 @@ def adjust_to_pixels(
         priors: how far the cameras may go from where they are.
         rounds: from coarse to fine.
         on_round: called after each.
+        starts: further cameras to start with; those go on that agree best with the matches after the first round.
     """
-    poses, K = cells.cameras.camera_from_world.astype(np.float32), cells.cameras.intrinsics.astype(np.float32)
-    depth, factor = cells.depth, 1.0
-    nothing = world = DenseWorld(
-        poses.astype(np.float64), 1.0, depth, np.zeros_like(depth), 0.0, _ERRORS[0], parallax=0.0, zoom=0.0
+    depth = cells.depth
+    world = nothing = DenseWorld(
+        cells.cameras.camera_from_world.astype(np.float64),
+        1.0,
+        depth,
+        np.zeros_like(depth),
+        0.0,
+        _ERRORS[0],
+        parallax=0.0,
+        zoom=0.0,
     )
+    begun = [_Start(poses.astype(np.float32), depth, 1.0) for poses in (cells.cameras.camera_from_world, *starts)]
     for each in rounds:
-        cameras = Cameras(poses, zoomed(K, factor))
-        expected, warp = expected_matches(depth, cameras, cells.grid)
         pictures = at_scale(grey, cells.grid, each.pixels)
-        found = match_pixels(pictures, expected, warp, cells.grid, each.window)
-        weight = found.weight * cells.is_static[:, None]
-        if not weight.any():  # such as windows that are larger than the coarse pictures of a narrow clip
+        fits = [fit for start in begun if (fit := _fit(cells, pictures, start, each, priors)) is not None]
+        if fits:
+            best = _best(fits)
+            begun, world = [best.start], _measured(cells, best, each)
+        else:  # such as windows that are larger than the coarse pictures of a narrow clip
             world = nothing
-            on_round()
-            continue
-        arrays = (depth, cameras, found.position, weight, cells.depth, np.float32(each.sigma))
-        made = jax.tree.map(np.asarray, _adjust(*arrays, cells.grid, priors))
-        poses, depth, factor = made.camera_from_world, made.depth, factor * float(made.focal)
-        with np.errstate(over="ignore"):
-            measured = np.clip(depth * np.exp(made.pull), *_DEPTHS)
-        matched = float((weight.sum(axis=1) > LEAST_WEIGHT).mean())
-        error = _error(cells.depth, measured, made.information)
-        parallax = _parallax(depth, Cameras(poses, zoomed(K, factor)), cells.grid)
-        zoom = _zoom(found.position, weight, made.position, each.sigma, cells.grid)
-        world = DenseWorld(poses.astype(np.float64), factor, measured, made.information, matched, error, parallax, zoom)
         on_round()
     return world
+
+
+class _Start(NamedTuple):
+    """Where a round begins."""
+
+    poses: Float32[np.ndarray, "S 3 4"]
+    depth: Float32[np.ndarray, "S P"]
+    focal: float  # factor of all focal lengths
+
+
+class _Fit(NamedTuple):
+    """What a round found."""
+
+    start: _Start
+    pull: Float32[np.ndarray, "S P"]  # to the depths that matches alone say
+    information: Float32[np.ndarray, "S P"]
+    position: Float32[np.ndarray, "S M P 2"]  # of cells in other frames
+    found: Float32[np.ndarray, "S M P 2"]  # where their pixels match
+    weight: Float32[np.ndarray, "S M P"]
+    agreement: float  # mean over matches of weight / (1 + (distance / sigma)^2); -inf if it is not finite
+
+
+def _best(fits: Sequence[_Fit]) -> _Fit:
+    """Return the fit that agrees best; one of further cameras must agree clearly better than the predicted ones."""
+    predicted, *others = fits
+    other = max(others, key=lambda fit: fit.agreement, default=predicted)
+    return other if other.agreement > max(_CLEARLY * predicted.agreement, predicted.agreement) else predicted
+
+
+def _fit(
+    cells: Cells, pictures: Float32[np.ndarray, "S h w"], start: _Start, each: Round, priors: CameraPriors
+) -> _Fit | None:
+    """Match and adjust once; None where nothing matches."""
+    K = cells.cameras.intrinsics.astype(np.float32)
+    cameras = Cameras(start.poses, zoomed(K, start.focal))
+    expected, warp = expected_matches(start.depth, cameras, cells.grid)
+    found = match_pixels(pictures, expected, warp, cells.grid, each.window)
+    weight = found.weight * cells.is_static[:, None]
+    if not weight.any():
+        return None
+    arrays = (start.depth, cameras, found.position, weight, cells.depth, np.float32(each.sigma))
+    made: Any = jax.tree.map(np.asarray, _adjust(*arrays, cells.grid, priors))
+    after = _Start(made.camera_from_world, made.depth, start.focal * float(made.focal))
+    apart = np.sum((found.position - made.position) ** 2, axis=-1)
+    agreement = float(np.mean(weight / (1 + apart / each.sigma**2)))
+    agreement = agreement if np.isfinite(agreement) else -np.inf
+    return _Fit(after, made.pull, made.information, made.position, found.position, weight, agreement)
+
+
+def _measured(cells: Cells, fit: _Fit, each: Round) -> DenseWorld:
+    """Return the world after a round."""
+    poses, depth, focal = fit.start
+    with np.errstate(over="ignore"):
+        measured = np.clip(depth * np.exp(fit.pull), *_DEPTHS)
+    cameras = Cameras(poses, zoomed(cells.cameras.intrinsics.astype(np.float32), focal))
+    return DenseWorld(
+        poses.astype(np.float64),
+        focal,
+        measured,
+        fit.information,
+        float((fit.weight.sum(axis=1) > LEAST_WEIGHT).mean()),
+        _error(cells.depth, measured, fit.information),
+        _parallax(depth, cameras, cells.grid),
+        _zoom(fit.found, fit.weight, fit.position, each.sigma, cells.grid),
+    )
 
 
 def _parallax(depth: Float32[np.ndarray, "S P"], cameras: Cameras, grid: tuple[int, int]) -> float:

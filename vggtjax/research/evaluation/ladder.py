@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import chain, count, product
 from typing import Any, Literal, NamedTuple, get_args
@@ -32,7 +32,6 @@ from vggtjax.research.evaluation.metrics.point_clouds import paired_distance
 from vggtjax.research.evaluation.metrics.trajectory import centre_error, rotation_error
 from vggtjax.research.evaluation.truth_at_pixels import known_points
 from vggtjax.results.reconstruction import Reconstruction
-from vggtjax.results.report import ErrorTable
 
 MaskSource = Literal["mined", "matches", "true"]
 
@@ -213,77 +212,6 @@ def _seen_motion(execute: Execute, passes: Passes, images: Any) -> Float[np.ndar
     if passes.motion is not None:
         return np.asarray(execute("motion", motion_pixels)(passes.motion, images))
     return np.asarray(execute("saliency", upsample)(passes.saliency, size=images.shape[2:4]))
-
-
-_COLUMNS = {
-    "abs_rel": ("AbsRel", "{:.3f}"),
-    "abs_rel_static": ("static", "{:.3f}"),
-    "abs_rel_dynamic": ("dynamic", "{:.3f}"),
-    "rotation_error": ("rotation", "{:.2f}°"),
-    "centre_error_ratio": ("centres", "{:.3f}"),
-    "mask_jaccard": ("mask IoU", "{:.2f}"),
-}
-
-
-def error_table(rows: Sequence[LadderRow], consistent: LadderRow | None = None) -> ErrorTable:
-    """Return the scores to print or to show on a page, a row per method and mask, and one of consistent depth."""
-    listed = rows if consistent is None else [*rows, replace(consistent, method="consistent")]
-    cells = [
-        (
-            row.method,
-            row.mask_source or "-",
-            *(
-                "-" if (value := getattr(row, name)) is None else form.format(value)
-                for name, (_, form) in _COLUMNS.items()
-            ),
-        )
-        for row in listed
-    ]
-    lines = [second_pass_in_words(rows)]
-    first = next((row for row in rows if row.method == "vggt"), None)
-    if consistent is not None and first is not None:
-        words = _change_in_words(first, consistent)
-        lines.append(f"Depth and cameras fitted to the clip's pixels, compared with the first pass: {words}.")
-    note = "\n".join(lines) + (
-        "\nAbsRel: of depth after one median scale. Rotation: mean, relative to the first "
-        "frame. Centres: RMSE after Sim(3), in median depths. Mask: mined from the first pass as in the paper, by "
-        "matches between its frames too, by the clip's pixels after the fit, or the true one."
-    )
-    return ErrorTable(("method", "mask", *(heading for heading, _ in _COLUMNS.values())), cells, note.lstrip())
-
-
-def second_pass_in_words(rows: Sequence[LadderRow]) -> str:
-    """Return what 4dvggt-d changes compared with vggt, the first pass alone: a sentence for each source of masks.
-
-    The rows are those of one clip; rows of the other methods, and rows without scores, are not read.
-    """
-    first = next((row for row in rows if row.method == "vggt"), None)
-    return "\n".join(
-        f"{_WORDS[source]}: the second pass {_steadies(first, row)} ({_change_in_words(first, row)})."
-        for source in get_args(MaskSource)
-        for row in rows
-        if first is not None and row.method == "4dvggt-d" and row.mask_source == source
-        if None not in {getattr(scores, name) for scores in (first, row) for name in ("abs_rel", *_CAMERA_SCORES)}
-    )
-
-
-_WORDS: dict[MaskSource, str] = {"mined": "Masks as in the paper", "matches": "Masks by matches", "true": "True masks"}
-_CAMERA_SCORES = ("rotation_error", "centre_error_ratio")
-
-
-def _change_in_words(first: LadderRow, second: LadderRow) -> str:
-    def change(name: str) -> str:
-        heading, form = _COLUMNS[name]
-        before, after = getattr(first, name), getattr(second, name)
-        word = "unchanged" if after == before else "better" if after < before else "worse"
-        return f"{heading} {word}, {form.format(before)} -> {form.format(after)}"
-
-    return "; ".join(map(change, (*_CAMERA_SCORES, "abs_rel")))
-
-
-def _steadies(first: LadderRow, second: LadderRow) -> str:
-    is_steadier = all(getattr(second, name) < getattr(first, name) for name in _CAMERA_SCORES)
-    return "steadies the cameras" if is_steadier else "does not steady the cameras"
 
 
 def _batches(count: int, size: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
