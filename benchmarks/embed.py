@@ -1,4 +1,4 @@
-"""Put a trained model and a held-out clip into the package, for `vggtjax demo`."""
+"""Put a trained model, a held-out clip and what the second pass changes into the package, for `vggtjax demo`."""
 
 from __future__ import annotations
 
