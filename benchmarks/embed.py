@@ -5,14 +5,16 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import get_args
 
 import jax
 import numpy as np
 from rich.console import Console
 from scipy.stats import rankdata
 
+from benchmarks import summaries
 from benchmarks.held_out import held_out_truth
 from vggtjax.clips.truth import Truth
 from vggtjax.config import VGGTConfig
@@ -31,8 +33,8 @@ from vggtjax.pipeline.pretrained.embedded import (
     demo_model,
 )
 from vggtjax.pipeline.pretrained.load import load_model
-from vggtjax.research.evaluation.ladder import LadderRow, ladder
-from vggtjax.research.evaluation.ladder_words import second_pass_over, write_second_pass
+from vggtjax.research.evaluation.ladder import LadderRow, MaskSource, ladder
+from vggtjax.research.evaluation.ladder_words import CAMERA_SCORES, Change, SecondPass, write_second_pass
 from vggtjax.storage.writing import writing
 from vggtjax.training.scenes import SceneConfig
 from vggtjax.training.scenes.held_out import MOVERS
@@ -97,6 +99,28 @@ def embed(
         console.print(f"{path}  {size} bytes  sha256 {hashlib.sha256(path.read_bytes()).hexdigest()}", soft_wrap=True)
 
 
+def second_pass_over(rows: Sequence[LadderRow]) -> SecondPass:
+    """Return what 4dvggt-d changes in the cameras' errors over clips, compared with vggt.
+
+    Clips count in which every row has these errors.
+
+    Raises:
+        InputError: fewer than two clips count.
+    """
+    unknown = {row.clip for row in rows if None in [getattr(row, name) for name in CAMERA_SCORES]}
+    known = [row for row in rows if row.clip not in unknown]
+    clips = len({row.clip for row in known})
+    if clips < 2:
+        raise InputError(f"{clips} scenes have errors of their cameras in every pass; ask for more scenes")
+    second = {
+        summary.mask_source: _shares(summary.changes)
+        for summary in summaries.summarise([known], CAMERA_SCORES)
+        if summary.method == "4dvggt-d"
+    }
+    sources: tuple[MaskSource, ...] = get_args(MaskSource)
+    return SecondPass(clips, {source: second[source] for source in sources if source in second})
+
+
 def write_demo_clip(path: Path, truth: Truth) -> None:
     """Write a clip for `demo_clip`: colours in 8 bits, depth in 16 bits, the mask in 1 bit."""
     steps = np.log(np.maximum(truth.depth, NEAREST) / NEAREST) / STEP
@@ -111,6 +135,13 @@ def write_demo_clip(path: Path, truth: Truth) -> None:
     )
     with writing(path) as temporary:
         temporary.write_bytes(content.getvalue())
+
+
+def _shares(changes: Mapping[str, summaries.Change]) -> dict[str, Change]:
+    """Return changes and their standard errors as shares of the first pass's mean error."""
+    return {
+        name: Change(change.mean / change.plain, (change.error or 0) / change.plain) for name, change in changes.items()
+    }
 
 
 def _fit_to_show(truth: Truth) -> Truth:

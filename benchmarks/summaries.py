@@ -56,10 +56,15 @@ class Change:
 
     mean: float  # over all clips
     error: float | None  # standard error over clips; None for a single clip
-    share: float | None  # of the plain pass's mean; None where that is 0
+    plain: float  # mean of the plain pass
     better: int  # draws whose mean is lower than the plain pass's
     best: int  # draws in which neither the plain pass nor a method with the same mask, pairs and suppression has less
     draws: int
+
+    @property
+    def share(self) -> float | None:
+        """The mean as a share of the plain pass's; None where that is 0."""
+        return self.mean / self.plain if self.plain > 0 else None
 
     def text(self, digits: int) -> str:
         spread = "" if self.error is None else f" ± {self.error:.{digits}f}"
@@ -87,14 +92,19 @@ def spread(values: Sequence[float]) -> Spread:
     return Spread(float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else None)
 
 
-def summarise(by_seed: Sequence[Sequence[LadderRow]]) -> list[Summary]:
-    """Summarise the ladder's rows of several seeds, setting by setting, in the order of the first seed."""
+def summarise(by_seed: Sequence[Sequence[LadderRow]], compared: Sequence[str] = AGAINST_FIRST) -> list[Summary]:
+    """Summarise the ladder's rows of several seeds, setting by setting, in the order of the first seed.
+
+    Args:
+        by_seed: rows of each seed.
+        compared: fields of `LadderRow` whose changes against the plain pass are wanted.
+    """
     found = []
     for setting in dict.fromkeys(_setting(row) for rows in by_seed for row in rows):
         draws = [draw for rows in by_seed if (draw := _draw(rows, setting)).rows]
         scores = {name: [_mean(draw.rows, name) for draw in draws] for name in METRICS}
-        ratios = {name: [_ratio(draw, name) for draw in draws] for name in AGAINST_FIRST}
-        changes = {name: _change(draws, name) for name in AGAINST_FIRST if setting[0] != FIRST}
+        ratios = {name: [_ratio(draw, name) for draw in draws] for name in compared}
+        changes = {name: _change(draws, name) for name in compared if setting[0] != FIRST}
         found.append(
             Summary(
                 *setting,
@@ -221,7 +231,7 @@ def _change(draws: Sequence[_Draw], name: str) -> Change | None:
     difference, plain = every[:, 0] - every[:, 1], float(every[:, 1].mean())
     mean = float(difference.mean())
     error = float(difference.std(ddof=1) / len(difference) ** 0.5) if len(difference) > 1 else None
-    return Change(mean, error, mean / plain if plain > 0 else None, better, best, len(draws))
+    return Change(mean, error, plain, better, best, len(draws))
 
 
 def _is_best(draw: _Draw, name: str) -> bool:

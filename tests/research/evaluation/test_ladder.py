@@ -23,11 +23,12 @@ from vggtjax.options import ABLATION
 from vggtjax.pipeline.fields import clip_fields
 from vggtjax.research.evaluation.ladder import LadderRow, ladder, score_result
 from vggtjax.research.evaluation.ladder_words import (
+    Change,
+    SecondPass,
     error_table,
     many_in_words,
     read_second_pass,
     second_pass_in_words,
-    second_pass_over,
     write_second_pass,
 )
 from vggtjax.research.evaluation.metrics.depth import depth_errors, median_scale
@@ -221,22 +222,14 @@ def test_words_follow_the_numbers(rows, rotation, centre, abs_rel, expected):
     assert error_table([first, second]).note.startswith(words)
 
 
-def test_changes_over_clips_are_shares_of_the_first_pass(rows, tmp_path):
-    plain = replace(only(rows, clip=0, method="vggt"), centre_error_ratio=0.02)
-    first = [replace(plain, clip=clip, rotation_error=error) for clip, error in enumerate((1.0, 2.0, 3.0, 9.0))]
-    second = [
-        replace(row, method="4dvggt-d", mask_source="true", rotation_error=error)
-        for row, error in zip(first, (1.0, 1.0, 2.5, 1.0), strict=True)
-    ]
-    second[3] = replace(second[3], centre_error_ratio=None)  # such as a camera that stands: the clip does not count
-    many = second_pass_over([*second, *first])
-    assert many.clips == 3
-    assert list(many.changes) == ["true"]
-    change = many.changes["true"]["rotation_error"]  # differences of 0, -1 and -0.5 degrees over a mean of 2
-    assert change == pytest.approx((-0.25, 0.25 / 3**0.5))
+def test_words_of_many_clips(rows, tmp_path):
+    many = SecondPass(
+        3, {"true": {"rotation_error": Change(-0.25, 0.144), "centre_error_ratio": Change(-0.001, 0.004)}}
+    )
     write_second_pass(tmp_path / "file.json", many)
     assert read_second_pass(tmp_path / "file.json") == many
     assert many_in_words(many).startswith("Over 3 such clips")
     assert many_in_words(many).endswith("True masks: rotation by -25 ± 14 %, centres by +0 ± 0 %.")
-    assert many_in_words(many) in error_table([first[0], second[0]], many=many).note
-    assert "centres unknown" in error_table([first[0]], second[3]).note
+    first = only(rows, clip=0, method="vggt")
+    assert many_in_words(many) in error_table([first], many=many).note
+    assert "centres unknown" in error_table([first], replace(first, centre_error_ratio=None)).note

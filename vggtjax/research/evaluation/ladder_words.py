@@ -8,8 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple, get_args
 
-import numpy as np
-
 from vggtjax.research.evaluation.ladder import LadderRow, MaskSource
 from vggtjax.results.report import ErrorTable
 from vggtjax.storage.writing import writing
@@ -22,7 +20,7 @@ _COLUMNS = {
     "centre_error_ratio": ("centres", "{:.3f}"),
     "mask_jaccard": ("mask IoU", "{:.2f}"),
 }
-_CAMERA_SCORES = ("rotation_error", "centre_error_ratio")
+CAMERA_SCORES = ("rotation_error", "centre_error_ratio")
 _WORDS: dict[MaskSource, str] = {"mined": "Masks as in the paper", "matches": "Masks by matches", "true": "True masks"}
 
 
@@ -88,30 +86,8 @@ def second_pass_in_words(rows: Sequence[LadderRow]) -> str:
         for source in get_args(MaskSource)
         for row in rows
         if first is not None and row.method == "4dvggt-d" and row.mask_source == source
-        if None not in {getattr(scores, name) for scores in (first, row) for name in ("abs_rel", *_CAMERA_SCORES)}
+        if None not in {getattr(scores, name) for scores in (first, row) for name in ("abs_rel", *CAMERA_SCORES)}
     )
-
-
-def second_pass_over(rows: Sequence[LadderRow]) -> SecondPass:
-    """Return what 4dvggt-d changes in the cameras' errors over clips, compared with vggt.
-
-    Clips count that have both errors in every one of these rows; at least two of them are needed, and rows of vggt.
-    """
-    read = [row for row in rows if row.method in ("vggt", "4dvggt-d")]
-    scores = {(row.method, row.mask_source, row.clip): [getattr(row, name) for name in _CAMERA_SCORES] for row in read}
-    unknown = {clip for (_, _, clip), values in scores.items() if None in values}
-    clips = sorted({row.clip for row in read} - unknown)
-    before = np.array([scores["vggt", None, clip] for clip in clips])
-    changes: dict[MaskSource, dict[str, Change]] = {}
-    for source in get_args(MaskSource):
-        if any(row.mask_source == source for row in read):
-            by = (np.array([scores["4dvggt-d", source, clip] for clip in clips]) - before) / before.mean(axis=0)
-            means, errors = by.mean(axis=0), by.std(axis=0, ddof=1) / len(clips) ** 0.5
-            changes[source] = {
-                name: Change(float(mean), float(error))
-                for name, mean, error in zip(_CAMERA_SCORES, means, errors, strict=True)
-            }
-    return SecondPass(len(clips), changes)
 
 
 def write_second_pass(path: Path, many: SecondPass) -> None:
@@ -153,4 +129,4 @@ def _change_in_words(first: LadderRow, second: LadderRow) -> str:
         word = "unchanged" if after == before else "better" if after < before else "worse"
         return f"{heading} {word}, {form.format(before)} -> {form.format(after)}"
 
-    return "; ".join(map(change, (*_CAMERA_SCORES, "abs_rel")))
+    return "; ".join(map(change, (*CAMERA_SCORES, "abs_rel")))
