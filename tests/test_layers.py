@@ -1,4 +1,4 @@
-"""The wings of docs/layout.md: imports run downwards only, and no imports form a circle."""
+"""The subpackages of docs/layout.md: imports run downwards only, and no imports form a circle."""
 
 import ast
 import re
@@ -18,7 +18,7 @@ Graph = dict[str, set[str]]
 
 
 def layers(text: str) -> dict[str, int]:
-    """Return wing or module -> its number, as the table says."""
+    """Return subpackage or module -> its number, as the table says."""
     rows = re.findall(r"^\| (\d+) \| (.*) \|$", text, flags=re.MULTILINE)
     return {name: int(layer) for layer, names in rows for name in re.findall(r"`(\w+)/?`", names)}
 
@@ -62,7 +62,7 @@ def room(module: str) -> str:
 
 
 def upward(graph: Graph, layer: dict[str, int]) -> list[str]:
-    """Return the imports that run upwards, or between wings of one number; the face of the package is above all."""
+    """Return the imports that run upwards, or between subpackages of one number; the face of the package is on top."""
     top = max(layer.values()) - 1
     rank = {module: layer.get(room(module), top) for module in set(graph).union(*graph.values())}
     return sorted(
@@ -112,7 +112,7 @@ def folders(graph: Graph) -> Graph:
     return arrows
 
 
-def test_imports_of_wings_form_no_circle(graph):
+def test_imports_of_subpackages_form_no_circle(graph):
     assert circle(folders(graph)) == []
     twice = {"vggtjax.method.mask": {"vggtjax.results.frame"}, "vggtjax.results.result": {"vggtjax.method.mask"}}
     assert set(circle(folders(graph | twice))) == {"results", "method"}

@@ -67,7 +67,7 @@ class ConsistencyReport:
         by = f"changed by {self.change:.1%} on average, to fit" if self.change else "not changed; only the cameras fit"
         return (
             f"{by} pixels in {self.cells:.0%} of the picture{points}; "
-            f"frames differ by {self.layers_after:.1%} in the middle, {self.layers_before:.1%} before{joined}"
+            f"frames differ by {self.layers_after:.1%} (median), {self.layers_before:.1%} before{joined}"
         )
 
 
@@ -162,7 +162,7 @@ def consistent_depth(
 
 
 def _agree(before: Float32[np.ndarray, " N"], after: Float32[np.ndarray, " M"], most: float) -> bool:
-    """Return whether the frames differ by at most so many times as before, in the middle."""
+    """Return whether the median difference of frames is at most so many times as large as before."""
     return len(after) > 0 and bool(np.median(after) <= most * np.median(before))
 
 

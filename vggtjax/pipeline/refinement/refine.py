@@ -29,7 +29,7 @@ _AFTER_MAPPING = (4, 2, 1, 1)
 _ROUNDS = sum(map(len, (*_SCHEDULES, _AFTER_MAPPING)))
 _FEWEST_POINTS = 24
 _FEWEST_OF_FRAME = 10  # observations; fewer do not hold a camera
-_MOST_SPREAD = 2.0  # factor by which adjusted and dense depth may differ in the middle, after one scale
+_MOST_SPREAD = 2.0  # factor by which adjusted and dense depth may differ (median), after one scale
 
 logger = logging.getLogger(__name__)
 
@@ -190,7 +190,7 @@ def adjust_to_tracks(
     if after >= before:
         reason = f"the reprojection error did not fall from {before:.2f} pixels"
     elif spread > _MOST_SPREAD:
-        reason = f"the adjusted points differ from the dense depth by a factor of {spread:.1f} in the middle"
+        reason = f"the adjusted points differ from the dense depth by a factor of {spread:.1f} (median)"
     if reason:
         return _reported(result, RefinementReport(False, reason, **numbers))
     K = result.intrinsics.astype(np.float64)
@@ -204,8 +204,8 @@ def adjust_to_tracks(
 def _fitted(adjusted: Adjusted, tracks: Tracks, result: Result) -> tuple[Float64[np.ndarray, "S 3 4"], float, float]:
     """Return the adjusted cameras in the world of the result, whose first camera and dense depth decide.
 
-    Depths agree in the middle at the scale of these cameras, the second value. The third is the factor, at least 1, by
-    which adjusted and dense depth then still differ in the middle.
+    The median depths agree at the scale of these cameras, the second value. The third is the factor, at least 1, by
+    which adjusted and dense depth then still differ (median).
     """
     poses, kept = adjusted.cameras.camera_from_world, adjusted.kept
     seen_by = poses[tracks.frames[kept]]
