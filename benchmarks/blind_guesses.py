@@ -112,7 +112,7 @@ def mean_depth_map(clips: Float[np.ndarray, "N S H W"]) -> Float64[np.ndarray, "
 
 def guesses(truth: Truth, prior: Prior) -> list[Guess]:
     """Return the guesses' errors on clips [B, S, ...] of the prior's height and width."""
-    return [_guess(clip, Truth(*(array[clip] for array in truth)), prior) for clip in range(len(truth.images))]
+    return [_guess(clip, truth.clip(clip), prior) for clip in range(len(truth.images))]
 
 
 def compare(rows: Sequence[LadderRow], guessed: Sequence[Guess]) -> list[Comparison]:

@@ -16,6 +16,7 @@ from rich.progress import Progress as Bars
 from benchmarks.real_clips import load_windows
 from vggtjax.cameras import world_from_camera
 from vggtjax.clips.clip import load_clip
+from vggtjax.clips.media.arrays import in_bytes
 from vggtjax.clips.truth import Truth, at_clip_pixels, batched_truth, intrinsics_at_clip_pixels
 from vggtjax.errors import InputError, check_extra
 from vggtjax.options import MethodName
@@ -26,6 +27,7 @@ from vggtjax.pipeline.refinement.refine import refine_with_points
 from vggtjax.research.evaluation.metrics.depth import depth_errors, measured, median_scale
 from vggtjax.research.evaluation.metrics.trajectory import rotation_error, trajectory_errors
 from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.storage.markdown import markdown_table
 from vggtjax.storage.writing import staging, writing
 from vggtjax.training.scenes import SceneConfig, held_out_scenes
 from vggtjax.training.scenes.held_out import Kind
@@ -107,15 +109,15 @@ def consistent_depth(
 
 def _generated(kind: Kind, truth: Truth) -> Iterator[Job]:
     for number in range(len(truth.images)):
-        of_clip = Truth(*(getattr(truth, name)[number] for name in Truth._fields))
-        yield Job(f"{kind} {number}", np.rint(255 * of_clip.images).astype(np.uint8), of_clip)
+        of_clip = truth.clip(number)
+        yield Job(f"{kind} {number}", in_bytes(of_clip.images), of_clip)
 
 
 def _filmed(folder: Path, config: Any, frames: int) -> Iterator[Job]:
     windows = load_windows(folder, config, frames)
     for number, name in enumerate(windows.names):
-        truth = Truth(*(getattr(windows.truth, field)[number] for field in Truth._fields))
-        yield Job(name, np.rint(255 * truth.images).astype(np.uint8), truth)
+        truth = windows.truth.clip(number)
+        yield Job(name, in_bytes(truth.images), truth)
 
 
 def _at_pixels(clip: Any, truth: Truth) -> Truth:
@@ -173,8 +175,7 @@ def _table(rows: list[dict[str, Any]]) -> Iterator[str]:
         first = of["as predicted"]
         yield f"{len(first)} clips, log errors of depth x {share:g}"
         yield ""
-        yield "| | " + " | ".join(METRICS.values()) + " | better | worst |"
-        yield "|---|" + "---:|" * (len(METRICS) + 2)
+        lines = []
         for way, found in of.items():
             cells = []
             for name in METRICS:
@@ -184,5 +185,5 @@ def _table(rows: list[dict[str, Any]]) -> Iterator[str]:
                 cells.append(f"{after.mean():.4f}" + ("" if found is first else change))
             ratio = np.array([row["abs_rel"] for row in found]) / [row["abs_rel"] for row in first]
             cells += ["", ""] if found is first else [f"{(ratio < 1).sum()} of {len(ratio)}", f"{ratio.max():.2f}"]
-            yield f"| {way} | " + " | ".join(cells) + " |"
-        yield ""
+            lines.append([way, *cells])
+        yield markdown_table(["", *METRICS.values(), "better", "worst"], lines, right=True)

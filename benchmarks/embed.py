@@ -16,12 +16,11 @@ from scipy.stats import rankdata
 
 from benchmarks import summaries
 from benchmarks.held_out import held_out_truth
+from vggtjax.clips.media.arrays import in_bytes
 from vggtjax.clips.truth import Truth
-from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
-from vggtjax.network.backbone import patch_positions
+from vggtjax.network.backbone import resized
 from vggtjax.network.checkpoint import numpy_dtype, save_model
-from vggtjax.network.layers import Params
 from vggtjax.pipeline.pretrained.embedded import (
     CLIP,
     MODEL,
@@ -30,12 +29,11 @@ from vggtjax.pipeline.pretrained.embedded import (
     SECOND_PASS,
     STEP,
     UNTRAINED_HEADS,
-    demo_model,
 )
 from vggtjax.pipeline.pretrained.load import load_model
 from vggtjax.research.evaluation.ladder import LadderRow, MaskSource, ladder
 from vggtjax.research.evaluation.ladder_words import CAMERA_SCORES, Change, SecondPass, write_second_pass
-from vggtjax.storage.writing import writing
+from vggtjax.storage.writing import staging, writing
 from vggtjax.training.scenes import SceneConfig
 from vggtjax.training.scenes.held_out import MOVERS
 
@@ -64,7 +62,8 @@ def embed(
     Args:
         model: a .safetensors written by `vggtjax train` or `vggtjax calibrate-cues`.
         frames: of the clip.
-        scenes: number of held-out scenes that the clip is chosen from, three times an odd number.
+        scenes: number of held-out scenes that the clip is chosen from, at least 3; three times an odd number has one in
+            the very middle.
         image_size: side in pixels that the model was last trained at, which becomes its own and the clip's; the
             model's own by default.
         height: of the clip in pixels, a multiple of the model's patch size; `image_size` by default.
@@ -81,43 +80,49 @@ def embed(
     if assets is not None:  # rooms are chosen when they are drawn
         truth = _fit_to_show(truth)
     network = dataclasses.replace(loaded.config, image_size=side)
-    params = {**loaded.params, "backbone": _at_size(loaded.params["backbone"], loaded.config, network)}
+    params = {**loaded.params, "backbone": resized(loaded.params["backbone"], loaded.config, network.grid_size)}
     params = jax.tree.map(lambda leaf: np.asarray(leaf).astype(numpy_dtype("bfloat16")), params)
-    save_model(MODEL, params, network, name="demo", note=NOTE, untrained_heads=UNTRAINED_HEADS)
-    rows = ladder(demo_model(), truth, methods=("vggt", "4dvggt-d"), masks=("mined", "matches", "true"))
-    write_second_pass(SECOND_PASS, second_pass_over(rows))
-    scene = _typical_scene(rows)
-    write_demo_clip(CLIP, Truth(*(array[scene] for array in truth)))
+    with staging(MODEL.parent) as staged:
+        made = {path: staged / path.name for path in (MODEL, CLIP, SECOND_PASS)}
+        save_model(made[MODEL], params, network, name="demo", note=NOTE, untrained_heads=UNTRAINED_HEADS)
+        rows = _known(
+            ladder(load_model(made[MODEL]), truth, methods=("vggt", "4dvggt-d"), masks=("mined", "matches", "true"))
+        )
+        write_second_pass(made[SECOND_PASS], second_pass_over(rows))
+        scene = _typical_scene(rows)
+        write_demo_clip(made[CLIP], truth.clip(scene))
+        for path, most in ((MODEL, MOST_MODEL_BYTES), (CLIP, MOST_CLIP_BYTES)):
+            if (size := made[path].stat().st_size) > most:
+                raise InputError(f"{path.name} has {size} bytes; at most {most} go into the package")
+        for path, new in made.items():
+            new.replace(path)
     console = Console()
     console.print(
         f"scene {scene} of {len(truth.depth)} has typical errors of the cameras, and a typical change of them"
     )
-    for path, most in ((MODEL, MOST_MODEL_BYTES), (CLIP, MOST_CLIP_BYTES)):
-        size = path.stat().st_size
-        if size > most:
-            raise InputError(f"{path} has {size} bytes; at most {most} go into the package")
-        console.print(f"{path}  {size} bytes  sha256 {hashlib.sha256(path.read_bytes()).hexdigest()}", soft_wrap=True)
+    for path in (MODEL, CLIP):
+        digest = hashlib.sha256(path.read_bytes()).hexdigest()
+        console.print(f"{path}  {path.stat().st_size} bytes  sha256 {digest}", soft_wrap=True)
+
+
+def _known(rows: Sequence[LadderRow]) -> list[LadderRow]:
+    """Return the rows of clips in which every row has errors of the cameras. Raises InputError below three clips."""
+    unknown = {row.clip for row in rows if None in [getattr(row, name) for name in CAMERA_SCORES]}
+    known = [row for row in rows if row.clip not in unknown]
+    if (clips := len({row.clip for row in known})) < 3:
+        raise InputError(f"{clips} scenes have errors of their cameras in every pass; ask for more scenes")
+    return known
 
 
 def second_pass_over(rows: Sequence[LadderRow]) -> SecondPass:
-    """Return what 4dvggt-d changes in the cameras' errors over clips, compared with vggt.
-
-    Clips count in which every row has these errors.
-
-    Raises:
-        InputError: fewer than two clips count.
-    """
-    unknown = {row.clip for row in rows if None in [getattr(row, name) for name in CAMERA_SCORES]}
-    known = [row for row in rows if row.clip not in unknown]
-    clips = len({row.clip for row in known})
-    if clips < 2:
-        raise InputError(f"{clips} scenes have errors of their cameras in every pass; ask for more scenes")
+    """Return what 4dvggt-d changes in the cameras' errors over clips, compared with vggt; every row has them."""
     second = {
         summary.mask_source: _shares(summary.changes)
-        for summary in summaries.summarise([known], CAMERA_SCORES)
+        for summary in summaries.summarise([rows], CAMERA_SCORES)
         if summary.method == "4dvggt-d"
     }
     sources: tuple[MaskSource, ...] = get_args(MaskSource)
+    clips = len({row.clip for row in rows})
     return SecondPass(clips, {source: second[source] for source in sources if source in second})
 
 
@@ -127,7 +132,7 @@ def write_demo_clip(path: Path, truth: Truth) -> None:
     content = io.BytesIO()
     np.savez_compressed(
         content,
-        images=np.rint(255 * truth.images).astype(np.uint8),
+        images=in_bytes(truth.images),
         log_depth=np.rint(np.minimum(steps, 65535)).astype(np.uint16),
         dynamic_mask=np.packbits(truth.dynamic_mask),
         camera_from_world=truth.camera_from_world.astype(np.float32),
@@ -150,31 +155,25 @@ def _fit_to_show(truth: Truth) -> Truth:
     fit = (truth.depth > 0).all(axis=(1, 2, 3)) & (moving >= MOVERS[0]) & (moving <= MOVERS[1])
     if not fit.any():
         raise InputError(f"none of {len(fit)} scenes has things that move and no sky; ask for more scenes")
-    return Truth(*(array[fit] for array in truth))
+    return truth.clip(fit)
 
 
 def _typical_scene(rows: Sequence[LadderRow]) -> int:
-    """Return the index of the median scene by change, of the middle third by the errors of the first pass."""
+    """Return the median clip by change, of the middle third by the errors of the first pass."""
     first, second = (
-        np.array(
-            [[row.rotation_error, row.centre_error_ratio] for row in rows if (row.method, row.mask_source) == each],
-            np.float64,
-        )
+        {
+            row.clip: [getattr(row, name) for name in CAMERA_SCORES]
+            for row in rows
+            if (row.method, row.mask_source) == each
+        }
         for each in (("vggt", None), ("4dvggt-d", "mined"))
     )
-    third = len(first) // 3
-    middle = _by_ranks(first)[third : len(first) - third]
-    return int(middle[_by_ranks((second - first)[middle])[len(middle) // 2]])
+    clips, third = np.array([*first]), len(first) // 3
+    before, after = (np.array([errors[clip] for clip in clips]) for errors in (first, second))
+    middle = _by_ranks(before)[third : len(clips) - third]
+    return int(clips[middle[_by_ranks((after - before)[middle])[len(middle) // 2]]])
 
 
 def _by_ranks(values: np.ndarray) -> np.ndarray:
     """Return the indices of rows in the order of the sums of their ranks in each column."""
     return np.argsort(rankdata(values, axis=0).sum(axis=1), kind="stable")
-
-
-def _at_size(backbone: Params, config: VGGTConfig, network: VGGTConfig) -> Params:
-    """Return the backbone with its positions resized, as `encode` resizes them for images of that size."""
-    positions = jax.numpy.asarray(backbone["position_embedding"], jax.numpy.float32)
-    grid = (network.grid_size, network.grid_size)
-    patches = patch_positions(positions[1:], config.grid_size, grid)
-    return {**backbone, "position_embedding": jax.numpy.concatenate([positions[:1], patches])}

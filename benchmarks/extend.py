@@ -8,7 +8,9 @@ import sys
 import numpy as np
 from jaxtyping import Float
 
+from benchmarks.held_out import held_out_truth
 from vggtjax.cameras import align, checked_centres, umeyama_sim3
+from vggtjax.clips.media.arrays import in_bytes
 from vggtjax.clips.truth import Truth
 from vggtjax.errors import InputError
 from vggtjax.options import Options
@@ -18,7 +20,8 @@ from vggtjax.pipeline.windows.extend import extend as extended
 from vggtjax.pipeline.windows.overlap import Places
 from vggtjax.pipeline.windows.plan import Extending
 from vggtjax.pipeline.windows.run import tools_of
-from vggtjax.training.scenes import SceneConfig, held_out_scenes
+from vggtjax.storage.markdown import markdown_table
+from vggtjax.training.scenes import SceneConfig
 
 _SHARED = 4  # frames that the two runs share, whose cameras join them
 
@@ -39,13 +42,13 @@ def extend(*, model: str = "demo", clips: int = 16, frames: int = 24, side: int 
         raise InputError(f"clips is {clips} and frames is {frames}; expected at least 2, and an even number from 12 on")
     logging.disable(logging.WARNING)
     network, half = load_model(model), frames // 2
-    scenes = held_out_scenes("dynamic", clips, SceneConfig(height=side, width=side, frames=frames), seed=seed)
-    images, options, errors, refused = np.round(255 * scenes.images).astype(np.uint8), Options(), [], 0
+    scenes = held_out_truth("dynamic", clips, SceneConfig(height=side, width=side, frames=frames), seed=seed)
+    images, options, errors, refused = in_bytes(scenes.images), Options(), [], 0
     patches = tools_of(network).patches
     own, others = [], []  # the largest overlap of a frame of the second half, and of one of another scene
     how = Extending(prefix="new_")
     for number in range(clips):
-        truth = Truth(*(np.asarray(getattr(scenes, name))[number] for name in Truth._fields))
+        truth = scenes.clip(number)
         first, whole, late = (
             reconstruct(network, images[number][part], options=options)
             for part in (slice(0, half), slice(0, frames), slice(half - _SHARED, frames))
@@ -70,11 +73,11 @@ def extend(*, model: str = "demo", clips: int = 16, frames: int = 24, side: int 
         sys.stderr.write(f"{number + 1} of {clips}: {np.round(errors[-1], 4).tolist()}\n")
     means = np.mean(errors, axis=0)
     names = ("one run over all frames", "extend", f"two runs joined by {_SHARED} cameras")
-    rows = [f"| {name} | {mean:.4f} | {mean / means[0]:.2f} |" for name, mean in zip(names, means, strict=True)]
-    table = ["| path error, median depths | mean | compared with one run |", "|---|---|---|", *rows]
+    rows = [[name, f"{mean:.4f}", f"{mean / means[0]:.2f}"] for name, mean in zip(names, means, strict=True)]
+    table = markdown_table(["path error, median depths", "mean", "compared with one run"], rows)
     told = f"{refused} of {clips} clips of another scene are refused; the best overlap of a clip is at least "
     told += f"{min(own):.2f} in its own scene, and at most {max(others):.2f} in another"
-    sys.stdout.write("\n".join([*table, "", told, ""]))
+    sys.stdout.write(f"{table}\n{told}\n")
 
 
 def _path_error(camera_from_world: Float[np.ndarray, "S 3 4"], truth: Truth) -> float:

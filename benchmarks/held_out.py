@@ -12,7 +12,7 @@ from vggtjax.training.scenes.held_out import Kind
 from vggtjax.training.world.truth import worlds_with_truth
 
 
-def held_out_truth(kind: Kind, count: int, config: SceneConfig, *, seed: int, assets: Path | None) -> Truth:
+def held_out_truth(kind: Kind, count: int, config: SceneConfig, *, seed: int, assets: Path | None = None) -> Truth:
     """Return `count` clips of a seed, with a leading axis; of worlds only the size and the frames of `config` count."""
     if assets is None:
         return batched_truth(held_out_scenes(kind, count, config, seed=seed))

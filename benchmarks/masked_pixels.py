@@ -10,13 +10,16 @@ from typing import TypeAlias
 import numpy as np
 from jaxtyping import Bool, UInt8
 
+from benchmarks.held_out import held_out_truth
+from vggtjax.clips.media.arrays import in_bytes
 from vggtjax.clips.truth import Truth
 from vggtjax.errors import InputError
 from vggtjax.pipeline.pretrained.load import load_model
 from vggtjax.pipeline.run import reconstruct
 from vggtjax.research.evaluation.metrics.depth import depth_errors, measured, median_scale
 from vggtjax.research.evaluation.metrics.trajectory import centre_error, rotation_error
-from vggtjax.training.scenes import SceneConfig, held_out_scenes
+from vggtjax.storage.markdown import markdown_table
+from vggtjax.training.scenes import SceneConfig
 
 Image: TypeAlias = UInt8[np.ndarray, "H W 3"]
 Mask: TypeAlias = Bool[np.ndarray, "H W"]
@@ -64,11 +67,11 @@ def masked_pixels(*, model: str = "demo", clips: int = 64, frames: int = 12, sid
         raise InputError("inpainting needs OpenCV: pip install opencv-python-headless") from error
     logging.disable(logging.WARNING)
     network, ways = load_model(model), [*FILLS, "keys suppressed (this method)"]
-    scenes = held_out_scenes("dynamic", clips, SceneConfig(height=side, width=side, frames=frames), seed=seed)
+    scenes = held_out_truth("dynamic", clips, SceneConfig(height=side, width=side, frames=frames), seed=seed)
     errors = np.zeros((len(ways), clips, len(_METRICS)))
     for number in range(clips):
-        truth = Truth(*(np.asarray(getattr(scenes, name))[number] for name in Truth._fields))
-        images = np.round(255 * truth.images).astype(np.uint8)
+        truth = scenes.clip(number)
+        images = in_bytes(truth.images)
         for row, fill in enumerate(FILLS.values()):
             painted = np.stack([fill(*each) for each in zip(images, truth.dynamic_mask, strict=True)])
             errors[row, number] = _errors(reconstruct(network, painted, method="vggt"), truth)
@@ -76,14 +79,15 @@ def masked_pixels(*, model: str = "demo", clips: int = 64, frames: int = 12, sid
         errors[-1, number] = _errors(suppressed, truth)
         sys.stderr.write(f"\r{number + 1} of {clips}")
     first = errors[0]
-    sys.stdout.write(f"\n| {clips} clips | {' | '.join(_METRICS)} |\n|---|{'---|' * len(_METRICS)}\n")
+    rows = []
     for way, found in zip(ways, errors, strict=True):
         change = (found - first).mean(axis=0) / first.mean(axis=0)
         error = (found - first).std(axis=0, ddof=1) / clips**0.5 / first.mean(axis=0)
         cells = [f"{mean:.4f}" for mean in found.mean(axis=0)]
         if found is not first and way != ways[0]:
             cells = [f"{c} ({d:+.1%} ± {e:.1%})" for c, d, e in zip(cells, change, error, strict=True)]
-        sys.stdout.write(f"| {way} | {' | '.join(cells)} |\n")
+        rows.append([way, *cells])
+    sys.stdout.write("\n" + markdown_table([f"{clips} clips", *_METRICS], rows))
 
 
 def _errors(result, truth: Truth) -> tuple[float, float, float]:

@@ -8,7 +8,6 @@ from tempfile import TemporaryDirectory
 from typing import Literal, NamedTuple
 
 import jax
-import numpy as np
 from PIL import Image
 from rich.console import Console
 from rich.progress import track
@@ -17,6 +16,7 @@ from rich.table import Table
 from benchmarks.command_worker import run_command
 from benchmarks.suite.report import console
 from tests.shared.seeded import seeded_images
+from vggtjax.clips.media.arrays import in_bytes
 from vggtjax.errors import InputError
 from vggtjax.network.checkpoint import Model
 from vggtjax.pipeline.memory import predicted_bytes
@@ -135,7 +135,7 @@ def measured(model: Model, name: str, setting: Setting) -> Row:
         frames = Path(folder) / "frames"
         frames.mkdir()
         for number, image in enumerate(seeded_images(*shape).transpose(0, 2, 3, 1)):
-            Image.fromarray(np.round(255 * image).astype(np.uint8)).save(frames / f"{number:04}.png")
+            Image.fromarray(in_bytes(image)).save(frames / f"{number:04}.png")
         words = ["reconstruct", str(frames), "--model", name, "--out", f"{folder}/out", *setting.words]
         answer = run_command(words, Path(folder) / "cache", setting.devices)
     return Row("embedded" if name == "demo" else "full", setting, predicted, answer["total"], answer["own"])

@@ -1,14 +1,11 @@
-"""Figures of the benchmarks, with matplotlib: the ladder with its spread, sweeps, paths of cameras."""
+"""Figures of the benchmarks, with matplotlib: the ladder with its spread, sweeps."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from benchmarks.summaries import METRICS, Summary
-from vggtjax.cameras import checked_centres, umeyama_sim3
 from vggtjax.storage.writing import writing
 
 SHOWN = ("abs_rel", "rotation_error", "centre_error", "point_distance_first")  # of those compared with the plain pass
@@ -77,26 +74,3 @@ def plot_sweep(path: Path, summaries: Sequence[Summary], method: str) -> None:
 def _save(figure, path: Path) -> None:
     with writing(path) as temporary:
         figure.savefig(temporary, dpi=120, format="png")
-
-
-def plot_paths(path: Path, cameras: dict[str, np.ndarray], true: np.ndarray, title: str) -> None:
-    """Draw the paths of cameras from above, each fitted to the true one by a similarity."""
-    from matplotlib.figure import Figure
-
-    columns = 3
-    rows = -(-len(cameras) // columns)
-    figure = Figure(figsize=(4 * columns, 4 * rows), layout="constrained")
-    wanted = checked_centres(true)
-    every = figure.subplots(rows, columns, squeeze=False).ravel()
-    for axes in every[len(cameras) :]:
-        axes.set_axis_off()
-    for axes, (way, poses) in zip(every, cameras.items(), strict=False):
-        found = umeyama_sim3(checked_centres(poses), wanted, allow_line=True).apply(checked_centres(poses))
-        axes.plot(wanted[:, 0], wanted[:, 2], color="0.6", linewidth=3, label="true")
-        axes.plot(found[:, 0], found[:, 2], color="tab:blue", linewidth=1.2, label="found")
-        axes.plot(*found[[0, -1]][:, [0, 2]].T, ".", color="tab:red", label="first, last")
-        axes.set_title(way, fontsize=9)
-        axes.set_aspect("equal")
-    figure.axes[0].legend(fontsize=8)
-    figure.suptitle(title)
-    _save(figure, path)

@@ -59,12 +59,12 @@ def _window(sequence: LabelledSequence, config: VGGTConfig, chosen: range) -> Tr
         raise InputError(f"{sequence.name}: {'; '.join(sequence.notes)}; expected depth/, K.txt and cameras")
     pictures = [str(sequence.pictures[frame]) for frame in chosen]
     clip = load_clip(pictures, size=config.image_size, patch=config.patch_size)
-    maps = [sequence.depth(frame) for frame in chosen]
-    depth = np.stack([each for each in maps if each is not None])
-    if len(depth) < len(maps):
-        raise InputError(f"{sequence.name} has {len(depth)} depth maps for {len(maps)} frames; expected one for each")
-    masks = None if sequence.mask is None else [sequence.mask(frame) for frame in chosen]
-    mask = depth < 0 if masks is None else np.stack([each for each in masks if each is not None])
+    depth = np.stack([sequence.depth(frame) for frame in chosen])
+    masks = [None if sequence.mask is None else sequence.mask(frame) for frame in chosen]
+    known = [each for each in masks if each is not None]
+    if sequence.mask is not None and len(known) < len(masks):
+        raise InputError(f"{sequence.name} has {len(known)} masks for {len(masks)} frames; expected one for each")
+    mask = np.stack(known) if known else depth < 0
     return Truth(
         images=clip.images,
         depth=at_clip_pixels(clip, depth),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +15,15 @@ from trimesh.sample import sample_surface
 
 from vggtjax.cameras import umeyama_sim3, unproject
 from vggtjax.clips.clip import load_clip
-from vggtjax.clips.truth import Truth, at_clip_pixels, batched_truth, intrinsics_at_clip_pixels
+from vggtjax.clips.media.arrays import in_bytes
+from vggtjax.clips.truth import at_clip_pixels, batched_truth, intrinsics_at_clip_pixels
 from vggtjax.errors import InputError
 from vggtjax.pipeline.pretrained.load import load_model
 from vggtjax.research.evaluation.metrics.point_clouds import nearest_distances
 from vggtjax.results.exports.mesh import static_mesh
 from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.shown import shown_points
+from vggtjax.storage.markdown import markdown_table
 from vggtjax.storage.writing import staging, writing
 from vggtjax.training.scenes import SceneConfig, held_out_scenes
 from vggtjax.training.scenes.held_out import Kind
@@ -68,9 +69,8 @@ def mesh_distance(
     truth = batched_truth(held_out_scenes(kind, clips, SceneConfig(height=side, width=side, frames=frames, samples=2)))
     rows = []
     for number in range(clips):
-        true = Truth(*(getattr(truth, name)[number] for name in Truth._fields))
-        pictures = np.rint(255 * true.images).astype(np.uint8)
-        clip = load_clip(pictures, size=network.config.image_size, patch=network.config.patch_size)
+        true = truth.clip(number)
+        clip = load_clip(in_bytes(true.images), size=network.config.image_size, patch=network.config.patch_size)
         result = reconstruct(network, clip, consistent_depth=consistent_depth)
         depth, moving = (at_clip_pixels(clip, maps) for maps in (true.depth, true.dynamic_mask))
         points = _points(depth, intrinsics_at_clip_pixels(clip, true.intrinsics), true.camera_from_world)
@@ -78,7 +78,7 @@ def mesh_distance(
         rows.append({"clip": number} | _measured(result, points, result.valid_pixels & ~moving, surface))
         shown = {name: value if isinstance(value, int) else round(value, 3) for name, value in rows[-1].items()}
         console.print(str(shown), highlight=False, soft_wrap=True)
-    text = "\n".join(_table(rows))
+    text = _table(rows)
     with writing(out / "rows.json") as temporary:
         temporary.write_text(json.dumps(rows, indent=1) + "\n")
     with writing(out / "report.md") as temporary:
@@ -129,15 +129,13 @@ def _one_a_cell(points: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "M 3"
     return points[np.unique(cells, axis=0, return_index=True)[1]]
 
 
-def _table(rows: list[dict[str, Any]]) -> Iterator[str]:
-    """Yield the lines of a table: medians of the clips' mean distances."""
-    yield "| mean distance (m), median of clips | |"
-    yield "|---|---:|"
-    for words, name in ROWS.items():
-        yield f"| {words} | {np.median([row[name] for row in rows]):.3f} |"
+def _table(rows: list[dict[str, Any]]) -> str:
+    """Return a table: medians of the clips' mean distances."""
+    lines = [[words, f"{np.median([row[name] for row in rows]):.3f}"] for words, name in ROWS.items()]
     for words, ours, theirs in (
         ("mesh nearer, at the points", "mesh_at_points", "points"),
         ("mesh nearer, evenly", "even_mesh", "even_points"),
     ):
-        yield f"| clips with the {words} | {sum(row[ours] < row[theirs] for row in rows)} of {len(rows)} |"
-    yield f"| seconds for the mesh | {np.median([row['seconds'] for row in rows]):.1f} |"
+        lines.append([f"clips with the {words}", f"{sum(row[ours] < row[theirs] for row in rows)} of {len(rows)}"])
+    lines.append(["seconds for the mesh", f"{np.median([row['seconds'] for row in rows]):.1f}"])
+    return markdown_table(["mean distance (m), median of clips", ""], lines, right=True)

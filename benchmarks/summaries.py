@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from benchmarks.blind_guesses import Comparison
 from vggtjax.research.evaluation.ladder import LadderRow
+from vggtjax.storage.markdown import markdown_table
 
 METRICS = {  # fields of LadderRow, and their names in tables and plots
     "abs_rel": "AbsRel",
@@ -168,16 +169,6 @@ def changes_table(summaries: Sequence[Summary]) -> str:
         if s.changes
     ]
     return markdown_table([*_SETTING, *(METRICS[name] for name in AGAINST_FIRST)], rows)
-
-
-def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a markdown table with padded columns."""
-    lines = [list(header), *map(list, rows)]
-    widths = [max(3, *(len(line[column]) for line in lines)) for column in range(len(header))]
-    lines.insert(1, ["-" * width for width in widths])
-    return "\n".join(
-        "| " + " | ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) + " |" for line in lines
-    )
 
 
 class _Draw(NamedTuple):

@@ -38,7 +38,7 @@ def published_config(tensors: Mapping[str, Tensor], weights: Weights) -> VGGTCon
     values: dict[str, Any] = {}
     with suppress(CheckpointError):  # of another program, or none
         values = read_json(weights.path.parent / "config.json", dict[str, Any], "the file", error=CheckpointError)
-    name, width = values.get("model_name"), own["camera_token"].shape[-1]
+    name, width = values.get("model_name"), (0, *own["camera_token"].shape)[-1]
     if isinstance(name, str) and name in DA3:
         return DA3[name]
     for config in DA3.values():

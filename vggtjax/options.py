@@ -182,7 +182,7 @@ class Options:
 
     @property
     def row(self) -> Method:
-        """The method's row, with `gram`, `suppress` and `threshold` overridden where they are given."""
+        """The method's row, with gram, suppress, threshold, refine and mask overridden where they are given."""
         method = METHODS[self.method]
         return dataclasses.replace(
             method,

@@ -1,1 +1,1 @@
-"""Speed and memory of the parts of vggtjax, compared with the machine's best: suite, memory, gpu-targets."""
+"""Speed and memory of the parts of vggtjax, compared with the machine's best."""

@@ -21,6 +21,7 @@ from rich.table import Table
 from benchmarks.suite.measure import Measured
 from benchmarks.suite.work import UNITS, Work, floor_by_kind, flop
 from vggtjax.errors import InputError
+from vggtjax.storage.markdown import markdown_table
 from vggtjax.storage.writing import writing
 
 _MOST_BYTES = 2**24  # read of a stored run
@@ -101,8 +102,7 @@ class Sheet(NamedTuple):
 
     def markdown(self) -> str:
         """Return a table of Markdown."""
-        lines = [self.headings, ("---", *["---:"] * (len(self.headings) - 1)), *self.rows]
-        return f"{self.title}\n\n" + "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
+        return f"{self.title}\n\n{markdown_table(self.headings, self.rows, right=True)}"
 
 
 def console() -> Console:

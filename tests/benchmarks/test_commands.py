@@ -87,18 +87,23 @@ def test_a_clip_survives_the_file(tmp_path):
 
 
 def test_embed(run, tiny, tmp_path, monkeypatch):
-    for name in ("MODEL", "CLIP", "SECOND_PASS"):
-        monkeypatch.setattr(embed, name, tmp_path / name)
-    monkeypatch.setattr(embed, "demo_model", lambda: read_model(tmp_path / "MODEL"))
+    made = {name: tmp_path / getattr(embed, name).name for name in ("MODEL", "CLIP", "SECOND_PASS")}
+    for name, path in made.items():
+        monkeypatch.setattr(embed, name, path)
     shown = run("embed", tiny, "--scenes", 3, "--frames", 3, "--image-size", 2 * SIDE)
-    model = read_model(tmp_path / "MODEL")
+    model = read_model(made["MODEL"])
     assert (model.name, model.config.image_size) == ("demo", 2 * SIDE)
-    assert f"{(tmp_path / 'CLIP').stat().st_size} bytes" in shown
-    assert read_second_pass(tmp_path / "SECOND_PASS").clips == 3
-    assert demo_clip(tmp_path / "CLIP").images.shape == (3, 2 * SIDE, 2 * SIDE, 3)
+    assert f"{made['CLIP'].stat().st_size} bytes" in shown
+    assert read_second_pass(made["SECOND_PASS"]).clips == 3
+    assert demo_clip(made["CLIP"]).images.shape == (3, 2 * SIDE, 2 * SIDE, 3)
     folder = write_assets(tmp_path / "assets")
-    run("embed", tiny, "--scenes", 9, "--frames", 3, "--image-size", 2 * SIDE, "--height", SIDE, "--assets", folder)
-    assert demo_clip(tmp_path / "CLIP").images.shape == (3, SIDE, 2 * SIDE, 3)
+    run("embed", tiny, "--scenes", 15, "--frames", 3, "--image-size", 2 * SIDE, "--height", SIDE, "--assets", folder)
+    assert demo_clip(made["CLIP"]).images.shape == (3, SIDE, 2 * SIDE, 3)
+    before = [path.read_bytes() for path in made.values()]
+    monkeypatch.setattr(embed, "MOST_CLIP_BYTES", 100)
+    with pytest.raises(InputError, match=r"clip\.npz has .* bytes; at most 100 go into the package"):
+        embed.embed(str(tiny), frames=3, scenes=3)
+    assert [path.read_bytes() for path in made.values()] == before
     assert embed._by_ranks(np.array([[3, 3], [1, 2], [2, 1.5]])).tolist() == [1, 2, 0]
 
 

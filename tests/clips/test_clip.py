@@ -109,7 +109,7 @@ def test_refit(tmp_path):
 
 
 def test_more_frames_than_fit(monkeypatch):
-    monkeypatch.setattr("vggtjax.clips.clip._MOST_BYTES", 3 * 12 * 28 * 14)
+    monkeypatch.setattr("vggtjax.clips.clip.MOST_BYTES", 3 * 12 * 28 * 14)
     assert len(load_clip(frames(*[(40, 20)] * 3), size=28)) == 3
     with pytest.raises(ClipError, match="more than 3 frames of 28 x 14 exceed"):
         load_clip(frames(*[(40, 20)] * 4), size=28)

@@ -19,6 +19,7 @@ from vggtjax.pipeline.inputs import read_inputs
 from vggtjax.pipeline.known.options import KnownGeometry
 from vggtjax.pipeline.run import read_cameras
 from vggtjax.pipeline.running import Running
+from vggtjax.pipeline.several import reconstruct_methods
 
 GIANT = dataclasses.replace(TINY, gated_mlp=40, leading_global=True, heads=("camera", "depth"))
 FRAMES, SIZE = 5, (56, 70)
@@ -120,3 +121,12 @@ def test_a_reference_is_for_networks_that_choose_one(model, clip, params, config
     assert middle.settings["reference"] == "middle"
     with pytest.raises(InputError, match="reference is 'middle'; leave it out, as this network takes the first frame"):
         reconstruct(Model(config, params), clip, reference="middle")
+
+
+@pytest.mark.filterwarnings("ignore:the field of view")
+def test_several_methods_have_the_cameras_of_one(model, clip):
+    """The network predicts cameras in a world of its own, which becomes the first camera's."""
+    made = reconstruct_methods(model, clip, ["4dvggt-d"], size=70)["4dvggt-d"]
+    np.testing.assert_allclose(made.camera_from_world[0], np.eye(3, 4), atol=1e-5)
+    alone = reconstruct(model, clip, method="4dvggt-d", size=70)
+    np.testing.assert_allclose(made.camera_from_world, alone.camera_from_world, rtol=1e-5, atol=1e-6)

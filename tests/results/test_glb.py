@@ -8,8 +8,9 @@ from scipy.spatial.transform import Rotation
 from tests.shared.glb_files import split_glb
 from tests.shared.room import WALL, make_room
 from vggtjax.results import glb, point_cloud
+from vggtjax.results.colors import LINEAR
 from vggtjax.results.exports.write import export_result
-from vggtjax.results.glb import _LINEAR, build_scene, glb_bytes, result_scene
+from vggtjax.results.glb import build_scene, glb_bytes, result_scene
 
 
 def load_scene(room):
@@ -32,8 +33,8 @@ def test_nodes_and_points():
 
 
 def test_dark_tones_stay_apart_and_nothing_is_lit():
-    assert (np.diff(_LINEAR) > 0).all()
-    np.testing.assert_allclose(_LINEAR[[0, 10, 255]], [0, 10 / 255 / 12.92, 1], rtol=1e-6)
+    assert (np.diff(LINEAR) > 0).all()
+    np.testing.assert_allclose(LINEAR[[0, 10, 255]], [0, 10 / 255 / 12.92, 1], rtol=1e-6)
     greys = np.repeat(np.arange(256), 3).reshape(-1, 3).astype("u1")
     cloud = point_cloud.PointCloud(np.zeros((256, 3), np.float32), greys)
     data = glb_bytes(build_scene(make_room(1), cloud, []))
@@ -45,7 +46,7 @@ def test_dark_tones_stay_apart_and_nothing_is_lit():
     assert {part["material"] for part in parts.values()} == {0}
     accessor = tree["accessors"][parts["static"]["attributes"]["COLOR_0"]]
     assert (accessor["componentType"], accessor["type"], accessor["count"]) == (5126, "VEC3", 256)
-    np.testing.assert_array_equal(read(parts["static"]["attributes"]["COLOR_0"])[:, 0], _LINEAR)
+    np.testing.assert_array_equal(read(parts["static"]["attributes"]["COLOR_0"])[:, 0], LINEAR)
 
 
 def test_points_are_limited_and_reproducible(monkeypatch):

@@ -28,7 +28,7 @@ logger = logging.getLogger(__name__)
 
 _MOST_WORKERS = 4
 _LARGE_CUT = 0.1  # share of a picture's pixels; larger cuts are warned about
-_MOST_BYTES = 2**34  # of the images of one clip; over 5000 frames of 518 x 518
+MOST_BYTES = 2**34  # of the images of one clip; over 5000 frames of 518 x 518
 Rendered = UInt8[np.ndarray, "H W 3"] | Float32[np.ndarray, "H W 3"]
 
 
@@ -74,10 +74,13 @@ class Clip:
 
         Raises ClipError where the source cannot be read any more, or gives other frames than before.
         """
+        number = -1
         for number, frame in enumerate(self.source.frames(self.sampling)):
             if number >= len(self) or frame.name != self.frame_names[number]:
                 raise ClipError(f"the source of the clip gives frame {frame.name}, not as before; load the clip anew")
             yield np.asarray(frame.image)
+        if number + 1 < len(self):
+            raise ClipError(f"the source of the clip gives {number + 1} of {len(self)} frames; load the clip anew")
 
     def refit(self, size: int, patch: int, mode: Mode | None = None) -> Clip:
         """Return the same frames, read from the source again, at another size, patch or mode.
@@ -189,9 +192,9 @@ def read_clip(
         for frame in watch.over(source.frames(sampling)):
             fit = fitter.fit(*frame.image.size, frame.name)
             width, height = fit.frame_size
-            if 12 * width * height * (len(fits) + 1) > _MOST_BYTES:  # 3 channels of 4 bytes
+            if 12 * width * height * (len(fits) + 1) > MOST_BYTES:  # 3 channels of 4 bytes
                 raise ClipError(
-                    f"more than {len(fits)} frames of {width} x {height} exceed the {_MOST_BYTES >> 30} GiB of a clip; "
+                    f"more than {len(fits)} frames of {width} x {height} exceed the {MOST_BYTES >> 30} GiB of a clip; "
                     f"take fewer with max_frames, stride or fps, or a smaller size"
                 )
             names.append(frame.name)

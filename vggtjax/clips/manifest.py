@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path, PurePath
 from typing import Any, TypeAlias
 
+from vggtjax.clips.captures.table import RECORD3D_SUFFIX
 from vggtjax.clips.media.images import is_image_name
 from vggtjax.clips.media.video import is_video_name
 from vggtjax.errors import ClipError, check_extra, one_line, reading
@@ -71,7 +72,8 @@ def source_name(source: str) -> str:
     """Return how a clip is called after its source: as the folder, or the file without the suffix."""
     if is_url(source):
         name = Path(url_name(source, ClipError))
-        return name.stem if is_video_name(name) or is_image_name(name) or name.suffix == ".r3d" else name.name
+        is_file = is_video_name(name) or is_image_name(name) or name.suffix.lower() == RECORD3D_SUFFIX
+        return name.stem if is_file else name.name
     path = Path(source)
     return path.name if os.path.isdir(path) else path.stem  # noqa: PTH112 - a path may be too long to ask for
 

@@ -151,7 +151,8 @@ def _fitted(masks: np.ndarray, clip: Clip, loaded: Clip) -> Bool[np.ndarray, "S 
         return np.stack([_resampled(mask, clip, i, _to_mask(mask, clip, i)) for i, mask in enumerate(masks)])
     if fits and {masks.shape[1:]} == sizes:
         return at_clip_pixels(clip, masks)
-    turns = [_turns(clip).get(name, 1) for name in clip.frame_names]
+    stored = _turns(clip) if fits else {}
+    turns = [stored.get(name, 1) for name in clip.frame_names]
     if fits and all(turn in _ACROSS for turn in turns) and {masks.shape[:0:-1]} == sizes:  # of the stored pixels
         return at_clip_pixels(clip, np.stack([turned(*pair) for pair in zip(masks, turns, strict=True)]))
     source = f" or {(len(clip), *sizes.pop())}, as the source's pictures" if len(sizes) == 1 else ""

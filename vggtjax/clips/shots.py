@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 from PIL import Image
 
+from vggtjax.clips.media.arrays import in_bytes
 from vggtjax.clips.media.sampling import Frame, Sampling, Source
 from vggtjax.errors import ClipError
 
@@ -62,7 +63,7 @@ def look_at(picture: Image.Image) -> Look:
 
 def looks_of(images: Float32[np.ndarray, "S H W 3"], boxes: Int[np.ndarray, "S 4"]) -> list[Look]:
     """Return the look of each frame of a clip, by the pixels that are not padding."""
-    return [look_at(Image.fromarray((255 * picture).astype(np.uint8))) for picture in _inside(images, boxes)]
+    return [look_at(Image.fromarray(in_bytes(picture))) for picture in _inside(images, boxes)]
 
 
 def _inside(images: np.ndarray, boxes: np.ndarray) -> Iterator[np.ndarray]:

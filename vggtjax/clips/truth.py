@@ -38,6 +38,10 @@ class Truth(NamedTuple):
     camera_from_world: np.ndarray
     intrinsics: np.ndarray
 
+    def clip(self, number: int | np.ndarray) -> Truth:
+        """Return one clip of a batch, or several."""
+        return Truth(*(array[number] for array in self))
+
 
 def batched_truth(truth: ClipTruth) -> Truth:
     """Return truth on the host with a batch axis. Raises InputError for shapes that do not fit together."""

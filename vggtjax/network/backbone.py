@@ -121,3 +121,13 @@ def patch_grid(images: Float[Array, "B S H W 3"], config: VGGTConfig) -> tuple[i
     if H % size or W % size:
         raise InputError(f"images are {H} x {W} pixels; expected multiples of the patch size {size}")
     return H // size, W // size
+
+
+def resized(backbone: Params, config: VGGTConfig, side: int) -> Params:
+    """Return a backbone's parameters with the table of positions for squares of `side` x `side` patches.
+
+    It is resized as `encode` resizes it for images of that size.
+    """
+    table = jnp.asarray(backbone["position_embedding"], jnp.float32)
+    patches = patch_positions(table[1:], config.grid_size, (side, side), by_scale=config.row.places_by_scale)
+    return {**backbone, "position_embedding": jnp.concatenate([table[:1], patches])}

@@ -110,7 +110,7 @@ def forward(
         suppression: the keys to suppress; none for the plain pass.
         changes: fields of `Suppression` (`dynamic_tokens`, `suppress`, `mask_pairs`, `strength`) in place of those of
             `suppression`, and fields of `Compute` (`compute_dtype`, `precision`, `remat`,
-            `stop_camera_gradient`, `attention`, `frames`).
+            `stop_camera_gradient`, `attention`, `reference`, `frames`).
 
     Raises:
         InputError: shapes that do not fit, or unknown names. Shapes are static, so this happens while tracing. NaN or

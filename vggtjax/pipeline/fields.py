@@ -12,6 +12,7 @@ from jaxtyping import Float
 from vggtjax.cameras import world_from_camera
 from vggtjax.clips.captures.frames import CaptureFrames
 from vggtjax.clips.clip import Clip
+from vggtjax.clips.media.arrays import in_bytes
 from vggtjax.clips.media.images import ImageFiles
 from vggtjax.clips.queries import Queries
 from vggtjax.clips.shots import looks_of
@@ -32,9 +33,7 @@ _MATCHED = "mined: matches between frames and Gram similarities"
 _NOT_MATCHED = "mined: Gram similarities, as matches between frames cannot be used"
 
 
-def assembled_fields(
-    assembly: Assembly, source: Predictions, clip: Clip, *, world_is_first: bool = True
-) -> dict[str, Any]:
+def assembled_fields(assembly: Assembly, source: Predictions, clip: Clip, *, world_is_first: bool) -> dict[str, Any]:
     """Return a method's depth, confidence and cameras of the first clip; the pass `source` gave the intrinsics.
 
     Frames of one colour have the lowest confidence of all pixels: nothing in them tells their depth. Unless the world
@@ -71,8 +70,7 @@ def clip_fields(clip: Clip) -> dict[str, Any]:
     """Return the fields of a Reconstruction that the clip gives."""
     names = ("timestamps", "source_size", "source_scale", "source_offset", "valid_box")
     fields: dict[str, Any] = {name: getattr(clip, name) for name in names}
-    images = np.round(clip.images * 255).astype(np.uint8)
-    return {**fields, "images": images, "frame_names": tuple(clip.frame_names)}
+    return {**fields, "images": in_bytes(clip.images), "frame_names": tuple(clip.frame_names)}
 
 
 def track_fields(queries: Queries, by_frame: dict[int, Tracks], frames: int) -> dict[str, Any]:

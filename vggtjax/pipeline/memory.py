@@ -15,20 +15,19 @@ from typing import Any, NamedTuple, Protocol, TypedDict, Unpack
 
 import jax
 
+from vggtjax.clips.clip import MOST_BYTES
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.network.heads.dpt_head import HIDDEN, PIXELS_AT_ONCE
 from vggtjax.network.kernels.cpu_attention import LOGITS_OF_ALL_HEADS, chunk_count
 from vggtjax.network.kernels.gathered_attention import GATHERED_AT_ONCE
-from vggtjax.options import find_method
+from vggtjax.options import find_method, has_accelerator
 from vggtjax.storage.memory import Room, host_room
 
 ERROR = 0.15  # of a measured peak: predictions are as near
 _FLOAT = 4  # bytes
 _PROCESS = 0.54e9  # Python, libraries, the compiler of one pass
 _COMPILING = 0.26e9  # more than that, where the second pass has a program of its own
-_LOGITS = 1  # copies of the attention of short frames, whose heads are computed at once
-_MOST_IMAGES = 2**34  # bytes of the images of a clip that is loaded as a whole
 
 
 class Rates(NamedTuple):
@@ -82,7 +81,7 @@ def predicted_bytes(
     same time: in a batch one is computed while the next is read and the last is written. The frames are shared by
     `devices`, each with a copy of the weights.
     """
-    host = on_cpu() if accelerator is None else not accelerator
+    host = not (has_accelerator() if accelerator is None else accelerator)
     here = min(devices, jax.local_device_count()) if host else 1  # devices that share one memory
     picture = clips * (_CPU if host else _ACCELERATOR).pixel * height * width
     held = frames if host else -(-frames // devices)  # every process loads the whole clip and returns all of it
@@ -99,13 +98,13 @@ def pass_bytes(
     config: VGGTConfig, frames: int, height: int, width: int, *, devices: int = 1, accelerator: bool | None = None
 ) -> float:
     """Return what the passes hold on each device beside weights, pictures and results: XLA's count, within a third."""
-    host = on_cpu() if accelerator is None else not accelerator
+    host = not (has_accelerator() if accelerator is None else accelerator)
     rates = _CPU if host else _ACCELERATOR
     share = -(-frames // devices)
     tokens = config.special_tokens + height * width // config.patch_size**2
     rows = rates.rows * tokens * config.embed_dim
     is_short = host and tokens**2 <= LOGITS_OF_ALL_HEADS
-    logits = _LOGITS * config.num_heads * tokens**2 if is_short else 0
+    logits = config.num_heads * tokens**2 if is_short else 0
     at_once = min(share, max(PIXELS_AT_ONCE // (height * width), 1))  # frames of the dense head, at most
     maps = rates.maps * max(config.dpt_features // 2, HIDDEN) * height * width
     largest = at_once * maps
@@ -122,7 +121,7 @@ def available(params: Any = None) -> Room | None:
     On a CPU what the process holds is included; on a GPU, of what is in use, `params` alone: arrays of a loaded model,
     of which those on the host take nothing. None stands for a model that is not loaded.
     """
-    if on_cpu():
+    if not has_accelerator():
         return host_room()
     stats = jax.local_devices()[0].memory_stats() or {}
     if "bytes_limit" not in stats:
@@ -154,13 +153,9 @@ def most_frames(
 
     `accelerator` and `how` are the options of `predicted_bytes`.
     """
-    low, high = 0, max(1, _MOST_IMAGES // (3 * _FLOAT * height * width)) + 1  # the first fits, the last does not
+    low, high = 0, max(1, MOST_BYTES // (3 * _FLOAT * height * width)) + 1  # the first fits, the last does not
     while high - low > 1:
         middle = (low + high) // 2
         fits = predicted_bytes(model, middle, height, width, accelerator=accelerator, **how) <= size
         low, high = (middle, high) if fits else (low, middle)
     return low
-
-
-def on_cpu() -> bool:
-    return jax.default_backend() == "cpu"

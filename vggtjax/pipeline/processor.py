@@ -70,10 +70,9 @@ def _kept_gain(facts: list[tuple[str, str]], channels: int) -> float:
     with suppress(OSError, ValueError, TypeError, KeyError):
         return float(json.loads(path.read_text(encoding="utf-8"))["gain"])
     narrow, wide = _seconds(channels)
-    with suppress(VggtjaxError, OSError):  # a cache that cannot be written costs the next run a third of a second
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with writing(path) as temporary:
-            temporary.write_text(json.dumps({"gain": wide / narrow}), encoding="utf-8")
+    # A cache that cannot be written costs the next run a third of a second.
+    with suppress(VggtjaxError, OSError), writing(path) as temporary:
+        temporary.write_text(json.dumps({"gain": wide / narrow}), encoding="utf-8")
     return wide / narrow
 
 

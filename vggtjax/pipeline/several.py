@@ -63,7 +63,7 @@ def reconstruct_methods(
         result = reconstruct(model, clip, options=shared, running=running, size=size)
         result = dataclasses.replace(result, settings=result.settings | known)
         for each in group:
-            results[each.method] = _as_method(result, each, fusion, clip, on_stage or no_stage)
+            results[each.method] = _as_method(model, result, each, fusion, clip, on_stage or no_stage)
     return {name: results[name] for name in methods}
 
 
@@ -77,7 +77,7 @@ def groups_of_methods(methods: Sequence[str], options: Options, motion: MotionCo
 
 
 def _as_method(
-    result: Reconstruction, options: Options, fusion: FusionRule | None, clip: Clip, on_stage: OnStage
+    model: Model, result: Reconstruction, options: Options, fusion: FusionRule | None, clip: Clip, on_stage: OnStage
 ) -> Reconstruction:
     """Return what another method makes of the passes that a result keeps."""
     method, passes = options.row, result.passes
@@ -90,7 +90,9 @@ def _as_method(
             warnings.simplefilter("ignore", FieldOfViewWarning)
         result = dataclasses.replace(
             result,
-            **assembled_fields(assembly, getattr(passes, method.intrinsics), clip),
+            **assembled_fields(
+                assembly, getattr(passes, method.intrinsics), clip, world_is_first=model.config.row.world_is_first
+            ),
             method=options.method,
             settings=settings if fusion is None else settings | {"fusion": fusion_digest(fusion)},
             passes=None,

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import jax
 
+from vggtjax.options import has_accelerator
 from vggtjax.progress import OnStage, Progress, no_progress, no_stage
 from vggtjax.storage.process import core_count, return_freed_memory
 
@@ -92,7 +93,7 @@ class Compile:
 @cache
 def _jitted(function: Callable[..., Any], static: tuple[str, ...]) -> Any:
     """Return a step's function under jit, compiled as fast as is sensible, unless XLA_FLAGS say it."""
-    options = _OPTIONS_ON_CPU if jax.default_backend() == "cpu" else {}
+    options = {} if has_accelerator() else _OPTIONS_ON_CPU
     given = os.environ.get("XLA_FLAGS", "")
     options = {name: value for name, value in options.items() if name not in given}
     return jax.jit(function, static_argnames=static, compiler_options=options or None)

@@ -7,6 +7,9 @@ from colorsys import hsv_to_rgb
 import numpy as np
 from jaxtyping import UInt8
 
+_LEVELS = np.arange(256) / 255  # of sRGB
+LINEAR = np.where(_LEVELS <= 0.04045, _LEVELS / 12.92, ((_LEVELS + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
 # Of matplotlib (CC0; turbo is by Google, Apache 2.0, RdBu by ColorBrewer, Apache 2.0).
 _RAMPS = {
     "turbo": "30123b 3f3e9c 4666dd 458cfd 2fb2f4 1ad4d0 22ebaa 52fa7a 8bff4b "

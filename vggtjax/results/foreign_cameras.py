@@ -50,7 +50,8 @@ def text_cameras(folder: Path, files: Sequence[int], quaternion: Quaternion | No
         if not kept or len(array) not in (len(poses), len(files)):
             raise ResultError(f"{name} has {len(array)} lines for {len(files)} frames of depth; expected one for each")
     rows = list(range(len(files))) if len(poses) == len(files) else [lines[number] for number in kept]
-    places = rows if len(intrinsics) == len(poses) else [list(files).index(number) for number in kept]
+    order = {number: place for place, number in enumerate(files)}
+    places = rows if len(intrinsics) == len(poses) else [order[number] for number in kept]
     inverse = np.full((len(rows), 4, 4), np.nan)
     found = np.isfinite(poses[rows]).all(axis=(1, 2))
     inverse[found] = world_from_camera(poses[rows][found][:, :3])

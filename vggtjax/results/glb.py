@@ -12,15 +12,13 @@ from trimesh.exchange.gltf import export_glb
 from trimesh.visual import ColorVisuals
 
 from vggtjax.cameras import FRUSTUM_EDGES, frustum_corners
-from vggtjax.results.colors import color_ramp
+from vggtjax.results.colors import LINEAR, color_ramp
 from vggtjax.results.gltf_animation import TO_GLTF
 from vggtjax.results.point_cloud import PointCloud
 from vggtjax.results.result import Result
 from vggtjax.results.shown import POINT_LIMIT, shown_points
 from vggtjax.storage.arrays import is_mapped
 
-_LEVELS = np.arange(256) / 255  # of sRGB
-_LINEAR = np.where(_LEVELS <= 0.04045, _LEVELS / 12.92, ((_LEVELS + 0.055) / 1.055) ** 2.4).astype(np.float32)
 _FLOAT = 5126  # glTF's name
 _UNLIT = {
     "pbrMetallicRoughness": {"baseColorFactor": [1.0, 1.0, 1.0, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0},
@@ -139,7 +137,7 @@ def _colors_of_gltf(buffers: dict[str, bytes], tree: dict[str, Any]) -> None:
         entry = list(tree["accessors"].values())[accessor]
         name = names[entry["bufferView"]]
         colors = np.frombuffer(buffers[name], np.uint8).reshape(-1, 4)[: entry["count"], :3]
-        buffers[name] = _LINEAR[colors].tobytes()
+        buffers[name] = LINEAR[colors].tobytes()
         entry |= {"componentType": _FLOAT, "type": "VEC3"}
         for key in ("normalized", "min", "max"):
             entry.pop(key, None)

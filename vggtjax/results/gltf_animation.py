@@ -34,6 +34,11 @@ def frame_times(result: Result) -> Float64[np.ndarray, " S+1"]:
     return np.append(times, times[-1] + np.median(np.diff(times)))
 
 
+def frame_rate(result: Result) -> float:
+    """Return frames a second: one over the median step of `frame_times`."""
+    return 1 / float(np.median(np.diff(frame_times(result))))
+
+
 def add_camera(result: Result, buffers: dict[str, bytes], tree: dict[str, Any]) -> None:
     """Add the node `camera`, which has the pose and the field of view of each frame at its time.
 

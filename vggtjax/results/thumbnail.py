@@ -53,14 +53,14 @@ def _webp(pictures: list[Image.Image], quality: int) -> bytes:
     return file.getvalue()
 
 
-def coarse(result: Result, most_frames: int = _CLIP_FRAMES, most_pixels: int = _CLIP_PIXELS) -> Result:
-    """Return a result of at most `most_frames` frames, evenly spread, and of every n-th row and column.
+def coarse(result: Result) -> Result:
+    """Return a result of at most `_CLIP_FRAMES` frames, evenly spread, and of every n-th row and column.
 
-    The points are some of the result's. At most about `most_pixels` pixels are left in all frames; padding has depth 0.
+    The points are some of the result's. At most about `_CLIP_PIXELS` are left in all frames; padding has depth 0.
     """
     count, height, width = result.depth.shape
-    frames = np.linspace(0, count - 1, min(count, most_frames)).round().astype(int)
-    step = max(1, int(np.ceil(np.sqrt(len(frames) * height * width / most_pixels))))
+    frames = np.linspace(0, count - 1, min(count, _CLIP_FRAMES)).round().astype(int)
+    step = max(1, int(np.ceil(np.sqrt(len(frames) * height * width / _CLIP_PIXELS))))
     step = min(step, height, width)
     first = (step - 1) // 2
     taken = np.s_[first : first + height // step * step : step, first : first + width // step * step : step]

@@ -19,7 +19,7 @@ from vggtjax.storage.writing import write_errors
 COMPILED_BYTES = 2 * 2**30  # of kept compiled programs; the least recently used go first
 CONVERTED = "converted weights"
 TRIALS = "trials"  # of what this computer does fast
-_KINDS = {
+_KINDS = {  # the commits and digests of hub ids, in hub/, are a record and stay
     "compiled programs": "compiled",
     "digests and shapes": "texts",
     "programs of earlier versions": "lowered",

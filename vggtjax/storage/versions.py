@@ -37,9 +37,8 @@ def running_versions() -> str:
 @cache
 def source_digest() -> str:
     """Return versions, platform, cores, and a digest of all sources: what results depend on besides arguments."""
-    import jax
-
+    from vggtjax.storage.backend import backend
     from vggtjax.storage.process import core_count
 
     versions = [version(name) for name in ("jax", "jaxlib", "flax")]
-    return f"{' '.join(versions)} {jax.default_backend()} {core_count()} {_package_digest()}"
+    return f"{' '.join(versions)} {backend()} {core_count()} {_package_digest()}"

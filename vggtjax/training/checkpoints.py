@@ -29,7 +29,7 @@ class Restored(NamedTuple):
 
     state: TrainingState
     recipe: Recipe
-    notes: dict[str, Any]
+    notes: Any  # JSON values of a stranger
 
 
 def latest(folder: str | Path) -> int | None:
@@ -89,7 +89,7 @@ def restore(folder: str | Path, shapes: TrainingState, recipe: Recipe) -> Restor
                 )
         _check_shapes(place, manager.item_metadata(step)[_STATE], shapes)
         items = manager.restore(step, args=orbax.args.Composite(**{_STATE: orbax.args.StandardRestore(target)}))
-    return Restored(items[_STATE], written, run["notes"])
+    return Restored(items[_STATE], written, run.get("notes"))
 
 
 def _opened(folder: Path, *, create: bool = False) -> orbax.CheckpointManager:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import math
 import time
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -17,6 +18,7 @@ from vggtjax.errors import CheckpointError, VggtjaxError
 from vggtjax.network.checkpoint import Model, numpy_dtype, save_model
 from vggtjax.network.layers import Params
 from vggtjax.network.model import HEADS
+from vggtjax.storage.json_values import Natural, NotNegative, parse_json
 from vggtjax.storage.writing import writing
 from vggtjax.training import checkpoints
 from vggtjax.training.metrics import Averages, Row, plot, read_metrics, write_metrics
@@ -50,15 +52,34 @@ def placement(recipe: Recipe) -> Placement:
     return Placement(NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec("clips")))
 
 
-def labels_of(recipe: Recipe, init: Model | Params | None, note: str) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Labels:
+    """What the file of a run's model says of it beside its name: `note` and `untrained_heads` of `Model`."""
+
+    note: str = ""
+    untrained_heads: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Notes:
+    """The counts of a run, as a checkpoint keeps them beside its state."""
+
+    averages: Averages
+    samples: Natural
+    skipped_in_a_row: Natural
+    seconds: NotNegative
+    labels: Labels
+
+
+def labels_of(recipe: Recipe, init: Model | Params | None, note: str) -> Labels:
     """Return note (`note` for random parameters, else that of `init`) and untrained heads of the model of a run.
 
     Untrained heads were untrained at the start, and the run leaves them unchanged. Parameters alone have no labels.
     """
     if init is not None and not isinstance(init, Model):
-        return {"note": "", "untrained_heads": []}
+        return Labels()
     note, untrained = (note, recipe.model.heads) if init is None else (init.note, init.untrained_heads)
-    return {"note": note, "untrained_heads": [head for head in untrained if HEADS[head] in recipe.frozen]}
+    return Labels(note, tuple(head for head in untrained if HEADS[head] in recipe.frozen))
 
 
 class Run:
@@ -70,7 +91,7 @@ class Run:
         out: Path,
         probes: Params,
         init: Params | None,
-        labels: dict[str, Any],
+        labels: Labels,
         options: RunOptions,
     ) -> None:
         """Resume from the newest checkpoint in `out`, or start with `probes` and `init` (None: random parameters)."""
@@ -141,17 +162,11 @@ class Run:
         if self.exported == self.step:
             return
         self.collect()
-        notes = {
-            "averages": asdict(self.averages),
-            "samples": self.samples,
-            "skipped_in_a_row": self.skipped_in_a_row,
-            "seconds": self.seconds,
-            "labels": self.labels,
-        }
-        checkpoints.save(self.checkpoints, self.state, self.recipe, notes)
+        notes = Notes(self.averages, self.samples, self.skipped_in_a_row, self.seconds, self.labels)
+        checkpoints.save(self.checkpoints, self.state, self.recipe, asdict(notes))
         averaged, dtype = exported(self.state, self.recipe), numpy_dtype(self.options.dtype)
         params = jax.tree.map(lambda leaf: np.asarray(leaf).astype(dtype, copy=False), averaged)
-        save_model(self.model_path, params, self.recipe.model, name=self.recipe.name, **self.labels)
+        save_model(self.model_path, params, self.recipe.model, name=self.recipe.name, **asdict(self.labels))
         self.exported, self._saved_at = self.step, time.perf_counter()
         logger.info("step %d of %d saved in %s", self.step, self.recipe.total_steps, self.out)
 
@@ -166,14 +181,8 @@ class Run:
             logger.warning("the recipe differs from that of the checkpoint; resuming with the new recipe")
         self.state = jax.device_put(restored.state, placement(self.recipe).whole)
         self.step = int(restored.state.step)
-        notes = restored.notes
-        try:
-            self.averages = Averages(**notes["averages"])
-            self.samples, self.skipped_in_a_row = int(notes["samples"]), int(notes["skipped_in_a_row"])
-            self.earlier = float(notes["seconds"])
-            self.labels = dict(notes["labels"])
-        except (KeyError, TypeError, ValueError) as error:
-            raise CheckpointError(
-                f"the checkpoint of step {self.step} in {self.checkpoints} lacks the counts of a training run ({error})"
-            ) from None
+        what = f"the counts of the run at step {self.step} in {self.checkpoints}"
+        notes = parse_json(json.dumps(restored.notes), Notes, what, error=CheckpointError)
+        self.averages, self.labels = notes.averages, notes.labels
+        self.samples, self.skipped_in_a_row, self.earlier = notes.samples, notes.skipped_in_a_row, notes.seconds
         logger.info("resuming from step %d of %d in %s", self.step, self.recipe.total_steps, self.out)

@@ -10,7 +10,7 @@ import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 
 from vggtjax.errors import CheckpointError, InputError
-from vggtjax.network.backbone import patch_positions
+from vggtjax.network.backbone import resized
 from vggtjax.network.checkpoint import Model
 from vggtjax.network.layers import Params
 from vggtjax.network.model import init_params
@@ -42,7 +42,7 @@ def start_params(recipe: Recipe) -> Params:
 def adapted(model: Model, recipe: Recipe) -> Params:
     """Return a model's parameters for a recipe with another image size, other motion cues, or new pairs of blocks.
 
-    The table of positions is resized as the backbone resizes the table for images of another size.
+    The table of positions is resized (`resized`).
 
     Raises CheckpointError if the model differs from the recipe's in anything else.
     """
@@ -55,10 +55,7 @@ def adapted(model: Model, recipe: Recipe) -> Params:
             f"the model '{model.name}' cannot start this recipe: it has {values}; use these values in the recipe's "
             f"model{without}, or start from another model"
         )
-    backbone, side = model.params["backbone"], config.grid_size
-    table = backbone["position_embedding"].astype(jnp.float32)
-    patches = patch_positions(table[1:], model.config.grid_size, (side, side), by_scale=config.row.places_by_scale)
-    params = {**model.params, "backbone": {**backbone, "position_embedding": jnp.concatenate([table[:1], patches])}}
+    params = {**model.params, "backbone": resized(model.params["backbone"], model.config, config.grid_size)}
     return deepened(params, recipe) if recipe.start.new_pairs else params
 
 

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int
 from vggtjax.network.checkpoint import check_parameters
 from vggtjax.network.layers import Params
 from vggtjax.network.model import parameter_shapes
+from vggtjax.storage.backend import backend
 from vggtjax.training.optimiser import join, make_optimiser, make_schedule, split
 from vggtjax.training.recipe import Recipe
 from vggtjax.training.start import start_params
@@ -111,4 +112,4 @@ def compute_dtype(recipe: Recipe) -> str:
     """Return the dtype of the blocks' matrix products: "auto" is bfloat16 on a GPU and float32 elsewhere."""
     if recipe.compute_dtype != "auto":
         return recipe.compute_dtype
-    return "bfloat16" if jax.default_backend() == "gpu" else "float32"
+    return "bfloat16" if backend() == "gpu" else "float32"

@@ -57,7 +57,7 @@ def test_a_long_clip_is_made_consistent_after_its_windows_are_joined(tmp_path, m
 
     monkeypatch.setattr(agreement, "consistent_depth", recorded)
     for consistent in (False, True):
-        plan, out = plan_of(masks=True), tmp_path / str(consistent)
+        plan, out = plan_of(), tmp_path / str(consistent)
         windows.run_windows(images, out, windows_of(loops=False), plan, tools_of(run), SETTINGS, consistent=consistent)
     assert seen == [(FRAMES, FRAMES)]
     made = [Reconstruction.load(tmp_path / str(consistent)) for consistent in (False, True)]

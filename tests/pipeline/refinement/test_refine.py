@@ -12,7 +12,7 @@ from vggtjax.cameras import world_from_camera
 from vggtjax.options import Options
 from vggtjax.pipeline.agreement import agree_with_pixels
 from vggtjax.pipeline.refinement.matches import frame_pairs
-from vggtjax.pipeline.refinement.refine import adjust_to_tracks, refine_cameras
+from vggtjax.pipeline.refinement.refine import adjust_to_tracks, refine_with_points, warn_of_kept
 from vggtjax.pipeline.refinement.tracks import join_matches
 from vggtjax.research.evaluation.metrics.trajectory import rotation_error, trajectory_errors
 
@@ -55,8 +55,8 @@ def test_pictures_refine_cameras_and_what_moves_has_no_vote():
         mask[frame, 50 // SCALE : 41, left : left + 33] = True
     steps = []
     known = dataclasses.replace(result, dynamic_mask=mask)
-    masked, report = refine_cameras(known, pictures, progress=lambda done, total: steps.append((done, total)))
-    unmasked, _ = refine_cameras(result, pictures)
+    masked, report, _ = refine_with_points(known, pictures, progress=lambda done, total: steps.append((done, total)))
+    unmasked = refine_with_points(result, pictures).result
     before, with_mask, without = (camera_errors(each, corner) for each in (result, masked, unmasked))
     assert report.refined
     assert with_mask[0] < 0.2 * before[0]
@@ -71,12 +71,13 @@ def test_clips_that_cannot_be_refined_keep_their_cameras(caplog):
     corner = make_corner()
     result = corner_result(corner)
     grey = np.full((6, HEIGHT, WIDTH, 3), 128, np.uint8)
-    kept, report = refine_cameras(result, grey)
+    kept, report, _ = refine_with_points(result, grey)
+    warn_of_kept(report)
     assert report.sentence == "the network's cameras were kept: 0 static points were matched; at least 24 are needed"
     assert report.sentence in caplog.text
     np.testing.assert_array_equal(kept.camera_from_world, result.camera_from_world)
     still = dataclasses.replace(result, dynamic_mask=np.ones_like(result.dynamic_mask))
-    assert refine_cameras(still, paint(corner))[1].points == 0
+    assert refine_with_points(still, paint(corner)).report.points == 0
     tracks = exact_tracks(corner)
     alone = tracks._replace(frames=np.where(tracks.frames == 4, 3, tracks.frames))
     assert "frame 4 sees 0 matched points" in adjust_to_tracks(result, alone)[1].reason
@@ -96,7 +97,7 @@ def test_two_frames_and_one():
     assert rotation_error(refined.camera_from_world, corner.camera_from_world) < 0.01
     np.testing.assert_allclose(refined.intrinsics, result.intrinsics, rtol=1e-6)  # two frames do not hold it
     single = corner_result(make_corner(1))
-    assert not refine_cameras(single, paint(make_corner(1)))[1].refined
+    assert not refine_with_points(single, paint(make_corner(1))).report.refined
 
 
 def test_pairs_and_tracks_by_hand():

@@ -27,9 +27,9 @@ def exact(clip) -> Reconstruction:
     return window_result(clip, 0, NOTHING)
 
 
-def reconstructed(out, run, *, loops=False, masks=True, source=None) -> Reconstruction:
+def reconstructed(out, run, *, loops=False, source=None) -> Reconstruction:
     images = np.asarray(walk().images) if source is None else source
-    cut, plan = walks.windows_of(loops=loops), walks.plan_of(masks=masks)
+    cut, plan = walks.windows_of(loops=loops), walks.plan_of()
     return run_windows(images, out, cut, plan, walks.tools_of(run), walks.SETTINGS)
 
 
@@ -73,7 +73,12 @@ def test_movers_spoil_the_path_unless_the_masks_leave_them_out(tmp_path, share, 
     assert path_error(masked) < 1e-5
     assert np.array_equal(masked.dynamic_mask, moving)
     assert np.array_equal(np.unique(masked.instances), [0, 1])  # one object, with one number in all windows
-    assert path_error(reconstructed(tmp_path / "none", run, masks=False)) > worse
+
+    def unmasked(clip):
+        made = run(clip)
+        return dataclasses.replace(made, dynamic_mask=np.zeros_like(made.dynamic_mask))
+
+    assert path_error(reconstructed(tmp_path / "none", unmasked)) > worse
 
 
 def test_windows_without_matches_leave_motion_to_the_others(tmp_path):

@@ -12,7 +12,6 @@ from vggtjax.cameras import Similarity, align
 from vggtjax.clips.clip import Clip
 from vggtjax.clips.preprocessing import Fitter
 from vggtjax.clips.truth import Truth
-from vggtjax.pipeline.windows.join import JoinRule
 from vggtjax.pipeline.windows.plan import Windows
 from vggtjax.pipeline.windows.run import LongRun, Tools
 from vggtjax.results.reconstruction import Reconstruction
@@ -80,10 +79,10 @@ def windows_of(*, loops: bool = False) -> Windows:
     return Windows(16, 4, no_loops=not loops)
 
 
-def plan_of(*, masks: bool = True) -> LongRun:
+def plan_of() -> LongRun:
     """Return how the walk is read and written."""
     fitter = Fitter(size=CONFIG.width, patch=8)
-    return LongRun(fitter=fitter, saving=Saving(only=("cameras", "depth")), rule=JoinRule(masks=masks))
+    return LongRun(fitter=fitter, saving=Saving(only=("cameras", "depth")))
 
 
 def tools_of(run) -> Tools:

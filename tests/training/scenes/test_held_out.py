@@ -71,6 +71,12 @@ def test_nothing_moves_in_static_scenes_and_batches_do_not_matter(monkeypatch):
     assert len({clip.tobytes() for clip in clips.camera_from_world}) == 3
 
 
+def test_a_config_without_hard_scenes_is_refused(monkeypatch):
+    monkeypatch.setattr(held_out, "_MOST_CANDIDATES", 16)
+    with pytest.raises(InputError, match="0 of 16 static scenes are hard enough for a test, and 3 are wanted; choose"):
+        held_out_scenes("static", 3, dataclasses.replace(JUDGED, static_camera=1.0))
+
+
 def test_bad_input_is_one_sentence():
     with pytest.raises(InputError, match="count of scenes is 0; expected a whole number of at least 1"):
         held_out_scenes("static", 0)

@@ -182,7 +182,8 @@ def there(pictures: Sequence[Path], source: Path, *, whole: bool) -> tuple[list[
     found = [place for place, path in enumerate(pictures) if whole or path.is_file()]
     if pictures and not found:
         raise InputError(f"{pictures[0]} is missing, and so is every picture that {source} names")
-    return found, tuple(path.stem for place, path in enumerate(pictures) if place not in found)
+    known = set(found)
+    return found, tuple(path.stem for place, path in enumerate(pictures) if place not in known)
 
 
 def checked_sizes(pictures: Sequence[Path], source: Path) -> tuple[tuple[int, int], ...]:

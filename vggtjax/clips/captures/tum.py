@@ -144,7 +144,7 @@ def depth_files(
     listed = read_list(folder, "depth.txt")
     owners = partners(times, listed.times)[frames]
     found = tuple(listed.paths[owner] if owner >= 0 else None for owner in owners)
-    missing = [path for path in found if path is not None and not path.is_file()]
+    missing = dict.fromkeys(path for path in found if path is not None and not path.is_file())
     if missing and whole:
-        raise InputError(f"{missing[0]} is missing, but depth.txt names it; get the capture whole")
+        raise InputError(f"{next(iter(missing))} is missing, but depth.txt names it; get the capture whole")
     return tuple(None if path in missing else path for path in found)

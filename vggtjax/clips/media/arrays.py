@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float, UInt8
 from PIL import Image
 
 from vggtjax.clips.media.sampling import Frame, Sampling
@@ -89,4 +90,9 @@ def eight_bit(values: np.ndarray, name: str) -> np.ndarray:
         raise ClipError(
             f"frame {name} has values from {lowest:g} to {highest:g}; expected floating point in [0, 1], or uint8"
         )
-    return np.rint(values.astype(np.float32).clip(0, 1) * 255).astype(np.uint8)
+    return in_bytes(values.astype(np.float32).clip(0, 1))
+
+
+def in_bytes(images: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
+    """Return images in [0, 1] as 8 bits, rounded to nearest, as results store them."""
+    return np.rint(255 * images).astype(np.uint8)

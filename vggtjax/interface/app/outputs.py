@@ -10,7 +10,7 @@ from vggtjax.results.films import film_frames, write_film
 from vggtjax.results.previews import layer_frames
 from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.viewer.page import viewer_page
-from vggtjax.results.viewer.scene import frame_rate
+from vggtjax.results.viewer.scene import playing_rate
 
 _FILM_SECONDS, _FILM_RATE, _FILM_SIZE = 4.0, 15.0, (640, 360)  # drawn in seconds; `vggtjax render` draws larger ones
 
@@ -31,7 +31,7 @@ def write_outputs(result: Reconstruction, saved: Path, on_stage: OnStage) -> tup
             frames = film_frames(result, seconds=_FILM_SECONDS, fps=_FILM_RATE, size=_FILM_SIZE, progress=progress)
             write_film(film, frames, _FILM_RATE)
         with on_stage("layers") as progress:
-            write_film(layers, layer_frames(result, progress), frame_rate(result))
+            write_film(layers, layer_frames(result, progress), playing_rate(result))
         with on_stage("zip"):
             archive = Path(shutil.make_archive(str(saved), "zip", root_dir=saved.parent, base_dir=saved.name))
     except BaseException:

@@ -55,7 +55,7 @@ def doctor(*, device: _Device = None, as_json: _AsJson = False, clear: _Clear = 
     Args:
         device: the longest clips for this GPU, which need not be here, in place of this computer
         as_json: print everything as one JSON object.
-        clear: first remove compiled programs, converted weights and kept passes from the cache.
+        clear: first remove what the cache keeps: compiled programs, converted weights, passes for fits and the like.
     """
     cleared = clear_cache() if clear else None
     report = Report()

@@ -16,7 +16,7 @@ import numpy as np
 from vggtjax.clips.masks import masks_digest
 from vggtjax.clips.media.sampling import Sampling
 from vggtjax.clips.preprocessing import Framing
-from vggtjax.errors import InputError, whole_number
+from vggtjax.errors import InputError, reading, whole_number
 from vggtjax.options import Options
 from vggtjax.pipeline.batch.destination import PAGE_NAME, SETTINGS_NAME
 from vggtjax.pipeline.known.options import KnownGeometry
@@ -147,7 +147,8 @@ class BatchRecipe(ClipRecipe):
         if self.masks is None:
             return {}
         if isinstance(self.masks, Path):
-            return {"masks": f"{self.masks} {file_digest(sorted(self.masks.rglob('*')))}"}
+            with reading(self.masks):
+                return {"masks": f"{self.masks} {file_digest(sorted(self.masks.rglob('*')))}"}
         if isinstance(self.masks, Mapping):
             return {"masks": {name: masks_digest(masks) for name, masks in sorted(self.masks.items())}}
         return {"masks": "nothing moves"}

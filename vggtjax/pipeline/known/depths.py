@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int64
 
 from vggtjax.clips.captures.capture import Capture
 from vggtjax.clips.truth import Placed
@@ -15,7 +15,7 @@ from vggtjax.results.result import Result
 from vggtjax.storage.csv_file import read_csv
 
 MOST_FILE_BYTES = 1 << 24
-_FRAME_DEPTHS = 10_000  # of a capture's map
+_FRAME_DEPTHS = 10_000  # of a map
 
 
 class DepthSamples(NamedTuple):
@@ -74,9 +74,8 @@ def sampled_depths(maps: Float32[np.ndarray, "S H W"], result: Result, name: str
     usable = result.valid_pixels & ~result.dynamic_mask & (maps > 0)
     found = []
     for frame, places in enumerate(usable):
-        rows, columns = np.nonzero(places)
-        step = max(1, -(-len(rows) // _FRAME_DEPTHS))
-        found.append(np.stack([np.full(len(rows), frame), rows, columns])[:, ::step])
+        rows, columns = _sampled(places)
+        found.append(np.stack([np.full(len(rows), frame), rows, columns]))
     frames, rows, columns = np.concatenate(found, axis=1)
     if not len(frames):
         raise InputError(f"the depth maps of {name} know nothing of the static pixels; give others, or a baseline")
@@ -93,9 +92,7 @@ def captured_depths(capture: Capture, result: Result) -> DepthSamples:
     for frame in range(len(result.depth)):
         if (depth := capture.depth(frame)) is None:
             continue
-        rows, columns = np.nonzero(usable[frame])
-        step = max(1, len(rows) // _FRAME_DEPTHS)
-        rows, columns = rows[::step], columns[::step]
+        rows, columns = _sampled(usable[frame])
         places = np.column_stack([columns, rows]) + 0.5
         shares = (places * result.source_scale[frame] + result.source_offset[frame]) / result.source_size[frame][::-1]
         x, y = (np.clip(shares[:, axis] * depth.shape[1 - axis], 0, depth.shape[1 - axis] - 1) for axis in (0, 1))
@@ -108,3 +105,10 @@ def captured_depths(capture: Capture, result: Result) -> DepthSamples:
         )
     frames, rows, columns, depths = np.concatenate(found).T
     return DepthSamples(frames.astype(int), rows.astype(int), columns.astype(int), depths)
+
+
+def _sampled(places: Bool[np.ndarray, "H W"]) -> tuple[np.ndarray, np.ndarray]:
+    """Return rows and columns of at most `_FRAME_DEPTHS` true pixels, evenly spread."""
+    rows, columns = np.nonzero(places)
+    step = max(1, -(-len(rows) // _FRAME_DEPTHS))
+    return rows[::step], columns[::step]

@@ -78,7 +78,6 @@ def consistent_depth(
     *,
     points: Measured | None = None,
     priors: CameraPriors = PREDICTED,
-    field: FieldPrior | None = None,
     join: bool = True,
     progress: Progress | None = None,
 ) -> tuple[AnyResult, ConsistencyReport]:
@@ -95,7 +94,6 @@ def consistent_depth(
         points: depths of bundle-adjusted points over the result's, as `refine_with_points` returns them with its
             cameras; fitted too where the pixels agree with these cameras.
         priors: how far the cameras may go.
-        field: how far the field may go; by the error of the depth, as far as it is measured, if None.
         join: take the mean of what several frames see.
         progress: called with the number of steps done, and of all.
 
@@ -141,7 +139,7 @@ def consistent_depth(
         measured = _measured(cells, world)
         if points is not None:
             measured = Measured(*map(np.concatenate, zip(measured, points, strict=True)))
-        fields = fit_field(measured, frames, size, field or FieldPrior.of_error(world.error))
+        fields = fit_field(measured, frames, size, FieldPrior.of_error(world.error))
         fitted, change = _by_field(by_cameras, fields, step)
         after = differences(fitted, step)
         made = fitted if _agree(before, after, _MOST_WORSE) else None

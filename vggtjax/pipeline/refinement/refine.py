@@ -74,22 +74,6 @@ def check_refinement(wanted: bool, known_poses: bool = False) -> None:
             raise InputError("refine_cameras and known poses exclude each other; give one of them")
 
 
-def refine_cameras(
-    result: AnyResult,
-    pictures: Iterable[UInt8[np.ndarray, "h w 3"]],
-    *,
-    fixed_intrinsics: bool = False,
-    progress: Progress | None = None,
-) -> tuple[AnyResult, RefinementReport]:
-    """Return the result with cameras that agree with matches between its pictures, and a report.
-
-    `refine_with_points` says more, and returns the depths of the matched points too.
-    """
-    refined = refine_with_points(result, pictures, fixed_intrinsics=fixed_intrinsics, progress=progress)
-    warn_of_kept(refined.report)
-    return refined.result, refined.report
-
-
 def warn_of_kept(report: RefinementReport) -> None:
     """Log a warning if the network's cameras were kept."""
     if not report.refined:

@@ -11,6 +11,7 @@ The old frames stay as they are, bit by bit.
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from itertools import islice
@@ -23,6 +24,7 @@ from jaxtyping import Float32, UInt8
 from PIL import Image
 
 from vggtjax.clips.clip import Clip, read_clip
+from vggtjax.clips.media.arrays import in_bytes
 from vggtjax.clips.media.sampling import Sampling
 from vggtjax.clips.preprocessing import Fitter
 from vggtjax.clips.sources import ClipSource, open_source
@@ -33,7 +35,7 @@ from vggtjax.network.checkpoint import Model
 from vggtjax.options import METHODS, Options
 from vggtjax.pipeline.agreement import agree_with_pixels
 from vggtjax.pipeline.running import check_kinds
-from vggtjax.pipeline.windows.growth import Growth, PlaceError, bytes_of
+from vggtjax.pipeline.windows.growth import Growth, PlaceError
 from vggtjax.pipeline.windows.plan import Extending
 from vggtjax.pipeline.windows.run import Tools, tools_of
 from vggtjax.pipeline.windows.store import FOLDER, WindowStore
@@ -139,7 +141,7 @@ def grow(
 
     def run(anchored: Clip, part: range) -> Reconstruction:
         name = window_name(part.start)
-        window = None if store is None else store.find(name, anchored.frame_names, bytes_of(anchored.images))
+        window = None if store is None else store.find(name, anchored.frame_names, in_bytes(anchored.images))
         if window is None:
             window = _agreeing(tools.run(anchored), clip, anchored, part, result, options)
             if store is not None:
@@ -216,7 +218,7 @@ def _check_clip(result: Reconstruction, clip: Clip, names: list[str]) -> None:
             f"the frame {one_line(equal[0], 60)!r}{more} of the new clip has the name of a frame of the result; give "
             "the new ones a prefix, such as --prefix day2_, or leave out frames that the result has"
         )
-    if twice := sorted({name for name in names if names.count(name) > 1}):
+    if twice := sorted(name for name, count in Counter(names).items() if count > 1):
         raise InputError(f"two new frames are named {one_line(twice[0], 60)!r}; expected a name for each")
 
 
@@ -252,7 +254,7 @@ def _agreeing(
 
     def pictures() -> Iterator[UInt8[np.ndarray, "h w 3"]]:
         height, width = (int(side) for side in anchored.source_size[0])
-        for image in bytes_of(anchored.images[:count]):
+        for image in in_bytes(anchored.images[:count]):
             yield np.asarray(Image.fromarray(image).resize((width, height), Image.Resampling.BICUBIC))
         yield from islice(clip.pictures(), part.start, part.stop)
 

@@ -9,12 +9,13 @@ import dataclasses
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, UInt8
+from jaxtyping import Bool, Float32, Float64
 from scipy.spatial.transform import Rotation
 
 from vggtjax.cameras import align, camera_centres, checked_centres
 from vggtjax.clips.clip import Clip
 from vggtjax.clips.fingerprint import source_setting
+from vggtjax.clips.media.arrays import in_bytes
 from vggtjax.errors import InputError
 from vggtjax.pipeline.windows.graph import IDENTITY, edge_of, solve_graph
 from vggtjax.pipeline.windows.join import Join, join_windows, reach_of
@@ -190,7 +191,7 @@ class Growth:
         parts = [old]
         if name in _OF_CLIP:
             new = getattr(self.clip, name)
-            parts.append(bytes_of(new) if name == "images" else new)
+            parts.append(in_bytes(new) if name == "images" else new)
         else:
             for number in self._in_order():
                 window, world = self._windows[number], self._worlds[number + 1]
@@ -244,11 +245,6 @@ class Growth:
             residual = min(join.residual for join in joins if join.pixels)
             reason = f"depth and cameras of their anchors differ by {residual:.0%} of the depth, more than {_WORST:.0%}"
         return PlaceError(f"{_listed(names)} cannot be joined: {reason}", names)
-
-
-def bytes_of(images: Float32[np.ndarray, "F H W 3"]) -> UInt8[np.ndarray, "F H W 3"]:
-    """Return images in [0, 1] as 8 bits, as results store them."""
-    return np.round(255 * images).astype(np.uint8)
 
 
 def _listed(names: list[str]) -> str:

@@ -9,7 +9,6 @@ disagree lose their say. Does not import jax.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -18,21 +17,14 @@ from jaxtyping import Bool, Float64
 from vggtjax.cameras import Similarity, camera_centres, umeyama_sim3, unproject
 from vggtjax.results.result import Result, inside_box, show_points
 
+_PERCENTILE = 30.0  # percent of the pixels to leave out, the least confident of each window
+_CAMERA_SHARE = 0.2  # of all weight: the cameras'; the pixels have the rest
+_MOST_PIXELS = 50_000  # evenly spread
 _LEAST_PIXELS = 64  # fewer shared pixels say less than the cameras do
 _LEAST_SCALE = 0.01  # of the residuals, relative to depth: smaller ones are rounding or the grain of the depth
 _ROUNDS = 30
 _SETTLED = 1e-7  # change of the fit between rounds, relative
 _NORMAL = 1.4826  # median of absolute values -> standard deviation
-
-
-@dataclass(frozen=True)
-class JoinRule:
-    """How windows are joined."""
-
-    masks: bool = True  # leave out what either window says moves
-    percentile: float = 30.0  # percent of the pixels to leave out, the least confident of each window
-    camera_share: float = 0.2  # of all weight: the cameras'; the pixels have the rest
-    most_pixels: int = 50_000  # evenly spread
 
 
 class Join(NamedTuple):
@@ -54,22 +46,21 @@ class _Frames(NamedTuple):
     poses: Float64[np.ndarray, "F 3 4"]
 
 
-def join_windows(first: Result, second: Result, pairs: Sequence[tuple[int, int]], rule: JoinRule = JoinRule()) -> Join:
+def join_windows(first: Result, second: Result, pairs: Sequence[tuple[int, int]]) -> Join:
     """Return how the second window's world lies in the first's.
 
-    Where the windows share fewer than 64 static pixels, their cameras alone are used, with a scale from the depth of
-    all shared pixels, and `pixels` is 0.
+    What either window says moves is left out. Where the windows share fewer than 64 static pixels, their cameras alone
+    are used, with a scale from the depth of all shared pixels, and `pixels` is 0.
 
     Args:
         first, second: results of two windows, with frames of one size.
         pairs: numbers of the same frame in the first and in the second window.
-        rule: what is used of them.
     """
     numbers = np.asarray(pairs, int).reshape(-1, 2)
     a, b = _frames(first, numbers[:, 0]), _frames(second, numbers[:, 1])
     valid = a.valid & b.valid
-    used = valid & ~(a.moving | b.moving) if rule.masks else valid
-    used &= _confident(a.confidence, used, rule.percentile) & _confident(b.confidence, used, rule.percentile)
+    used = valid & ~(a.moving | b.moving)
+    used &= _confident(a.confidence, used, _PERCENTILE) & _confident(b.confidence, used, _PERCENTILE)
     known = used if (count := int(used.sum())) >= _LEAST_PIXELS else valid
     reach_a, reach_b = _reaches(a, b, known)
     camera_a, camera_b = _camera_points(a.poses, reach_a), _camera_points(b.poses, reach_b)
@@ -77,13 +68,13 @@ def join_windows(first: Result, second: Result, pairs: Sequence[tuple[int, int]]
         found = umeyama_sim3(camera_b, camera_a, allow_line=True)
         return Join(found, _median_residual(found, camera_b, camera_a, np.full(len(camera_a), reach_a)), 0)
     chosen = np.flatnonzero(used.ravel())
-    chosen = chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), rule.most_pixels)).round().astype(int)]
+    chosen = chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), _MOST_PIXELS)).round().astype(int)]
     target, source = (np.concatenate([w.points.reshape(-1, 3)[chosen], c]) for w, c in ((a, camera_a), (b, camera_b)))
     depth = np.concatenate([a.depth.ravel()[chosen], np.full(len(camera_a), reach_a)])
     shares = np.concatenate(
         [
-            np.full(len(chosen), (1 - rule.camera_share) / len(chosen)),
-            np.full(len(camera_a), rule.camera_share / len(camera_a)),
+            np.full(len(chosen), (1 - _CAMERA_SHARE) / len(chosen)),
+            np.full(len(camera_a), _CAMERA_SHARE / len(camera_a)),
         ]
     )
     found = _robust(source, target, depth, shares)

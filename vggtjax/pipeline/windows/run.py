@@ -41,7 +41,6 @@ from vggtjax.pipeline.run import reconstruct
 from vggtjax.pipeline.running import Running
 from vggtjax.pipeline.steps import Execute
 from vggtjax.pipeline.windows.frames import SeenFrames, count_frames, window_clips
-from vggtjax.pipeline.windows.join import JoinRule
 from vggtjax.pipeline.windows.overlap import thinned
 from vggtjax.pipeline.windows.plan import Windows, plan_windows
 from vggtjax.pipeline.windows.store import FOLDER, WindowStore, write_cut
@@ -81,7 +80,6 @@ class LongRun(NamedTuple):
     saving: Saving = Saving()
     tracks: Queries | str | None = None  # points to follow: in pixels of the fitted frames, or words for parse_queries
     on_stage: OnStage = no_stage
-    rule: JoinRule = JoinRule()
 
 
 def reconstruct_long(
@@ -251,7 +249,7 @@ def run_windows(
     with locked_folder(out / FOLDER, "the windows of a clip"):
         store = WindowStore(out, decides)
         write_cut(out, windows.window, windows.shared)
-        whole = Whole(store, cut, tools.run, plan.rule, plan.on_stage)
+        whole = Whole(store, cut, tools.run, plan.on_stage)
         clip, seen = first, SeenFrames()
         if before := store.count():
             logger.info("%d of %d windows are kept from a run that was stopped", before, len(cut))

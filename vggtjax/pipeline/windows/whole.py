@@ -17,11 +17,12 @@ from jaxtyping import Float32
 
 from vggtjax.cameras import Similarity
 from vggtjax.clips.clip import Clip
+from vggtjax.clips.media.arrays import in_bytes
 from vggtjax.clips.queries import Queries
 from vggtjax.pipeline.windows.blend import WindowView, blend_frame
 from vggtjax.pipeline.windows.frames import clip_of
 from vggtjax.pipeline.windows.graph import LEAST_RESIDUAL, Edge, edge_of, solve_graph
-from vggtjax.pipeline.windows.join import Join, JoinRule, join_windows, reach_of
+from vggtjax.pipeline.windows.join import Join, join_windows, reach_of
 from vggtjax.pipeline.windows.loops import Loop, described_frames, find_loops, frames_around
 from vggtjax.pipeline.windows.plan import blend_weights, shared_frames
 from vggtjax.pipeline.windows.store import WindowStore
@@ -57,7 +58,6 @@ class Whole:
     store: WindowStore
     windows: Sequence[range]
     run: Callable[[Clip], Reconstruction]  # for windows that verify loops
-    rule: JoinRule = JoinRule()
     on_stage: OnStage = no_stage
     joins: list[Join] = field(default_factory=list)
     loops: list[TriedLoop] = field(default_factory=list)
@@ -113,7 +113,7 @@ class Whole:
                 if last is not None:
                     before = self.windows[number - 1]
                     shared = shared_frames(before, window)
-                    join = join_windows(last, here, [(f - before.start, f - window.start) for f in shared], self.rule)
+                    join = join_windows(last, here, [(f - before.start, f - window.start) for f in shared])
                     if not join.pixels:
                         logger.warning(
                             "windows %d and %d, which share frames %d to %d, share no static pixels to be joined by; "
@@ -158,12 +158,12 @@ class Whole:
         frames = [(a, f - first.start) for f in of_first] + [(b, f - second.start) for f in of_second]
         clip = clip_of(frames, like)
         name = f"loop-{loop.first_frame:06d}-{loop.second_frame:06d}"
-        between = self.store.find(name, clip.frame_names, np.round(clip.images * 255).astype(np.uint8))
+        between = self.store.find(name, clip.frame_names, in_bytes(clip.images))
         if between is None:
             between = self.run(clip)
             self.store.save(name, between)
-        to_first = join_windows(a, between, [(f - first.start, i) for i, f in enumerate(of_first)], self.rule)
-        to_second = join_windows(b, between, [(f - second.start, half + i) for i, f in enumerate(of_second)], self.rule)
+        to_first = join_windows(a, between, [(f - first.start, i) for i, f in enumerate(of_first)])
+        to_second = join_windows(b, between, [(f - second.start, half + i) for i, f in enumerate(of_second)])
         worst, usual = max(to_first.residual, to_second.residual), self._usual()
         used = bool(to_first.pixels and to_second.pixels) and worst <= min(_WORSE * usual, _WORST)
         self.loops.append(TriedLoop(loop, worst, used))
@@ -232,6 +232,6 @@ def store_window(
 ) -> None:
     """Run, describe and store a window, unless it is stored already."""
     name = window_name(number)
-    if store.find(name, clip.frame_names, np.round(clip.images * 255).astype(np.uint8)) is None:
+    if store.find(name, clip.frame_names, in_bytes(clip.images)) is None:
         described = [frame - window.start for frame in described_frames(window)]
         store.save(name, run(clip), describe(clip.images[described]))

@@ -223,7 +223,7 @@ def _batches(count: int, size: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
 
 
 def _scene(clip: int, truth: Truth) -> _Scene:
-    own = Truth(*(array[clip] for array in truth))
+    own = truth.clip(clip)
     points = known_points(own.depth, own.intrinsics, own.camera_from_world, measured(own.depth))
     return _Scene(clip, own, points)
 

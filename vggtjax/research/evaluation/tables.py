@@ -10,6 +10,7 @@ from typing import NamedTuple
 from vggtjax.errors import one_line
 from vggtjax.research.evaluation.metrics.camera_pairs import THRESHOLDS
 from vggtjax.research.evaluation.records import Record
+from vggtjax.storage.markdown import markdown_table
 
 
 class Column(NamedTuple):
@@ -92,16 +93,16 @@ def best(means: Mapping[str, Mapping[str, float]], column: Column) -> set[str]:
 def markdown(means: Mapping[str, Mapping[str, float]]) -> str:
     """Return the means as a Markdown table, the best of each column in bold."""
     columns = shown_columns(means)
-    lines = [
-        "| Method | "
-        + " | ".join(f"{column.heading} {ARROWS[column.better]}".strip() for column in columns)
-        + " | Failed |",
-        "|---|" + "---|" * (len(columns) + 1),
+    headings = [f"{column.heading} {ARROWS[column.better]}".strip() for column in columns]
+    rows = [
+        [
+            _plain(method),
+            *(f"**{cell(row, c)}**" if method in best(means, c) else cell(row, c) for c in columns),
+            str(failed(row)),
+        ]
+        for method, row in means.items()
     ]
-    for method, row in means.items():
-        cells = [f"**{cell(row, c)}**" if method in best(means, c) else cell(row, c) for c in columns]
-        lines.append(f"| {_plain(method)} | " + " | ".join(cells) + f" | {failed(row)} |")
-    return "\n".join(lines) + "\n"
+    return markdown_table(["Method", *headings, "Failed"], rows)
 
 
 def latex(means: Mapping[str, Mapping[str, float]]) -> str:
@@ -138,7 +139,7 @@ def failed(row: Mapping[str, float]) -> str:
 
 
 def _plain(text: str) -> str:
-    return one_line(text).replace("\\", "\\\\").replace("|", r"\|")
+    return one_line(text).replace("\\", "\\\\")
 
 
 def _inert(text: str) -> str:

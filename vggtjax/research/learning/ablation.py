@@ -22,6 +22,7 @@ from vggtjax.research.evaluation.metrics.depth import depth_alignment, depth_err
 from vggtjax.research.evaluation.metrics.uncertainty import reliability_curve, uncertainty_scores
 from vggtjax.research.learning.clip_passes import ClipPasses, fit_clips, observations
 from vggtjax.research.learning.fit import NEEDS_FRAMES, FitConfig, FitOutcome, fit_fusion
+from vggtjax.storage.markdown import markdown_table
 
 METRICS = {
     "abs_rel": "AbsRel",
@@ -224,11 +225,11 @@ def gains(scores: Sequence[RuleScore], against: str = PAPER) -> dict[str, dict[s
 def markdown(rows: Mapping[str, Mapping[str, tuple[float, float]]]) -> str:
     """Return the rows of `table` in Markdown, mean ± standard deviation."""
     names = [name for name in METRICS if any(name in row for row in rows.values())]
-    lines = ["| rule | " + " | ".join(METRICS[name] for name in names) + " |", "|---" * (len(names) + 1) + "|"]
-    for rule, row in rows.items():
-        cells = [f"{row[name][0]:.4f} ± {row[name][1]:.4f}" if name in row else "-" for name in names]
-        lines.append(f"| {rule} | " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+    cells = [
+        [rule, *(f"{row[name][0]:.4f} ± {row[name][1]:.4f}" if name in row else "-" for name in names)]
+        for rule, row in rows.items()
+    ]
+    return markdown_table(["rule", *(METRICS[name] for name in names)], cells)
 
 
 def _by_rule(scores: Sequence[RuleScore]) -> dict[str, dict[int, dict[str, float]]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import platform
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from vggtjax.network.checkpoint import Model
 from vggtjax.research.parity.outputs import Parity
 from vggtjax.research.parity.own_run import Check, Frames
 from vggtjax.research.parity.public_run import Facts
+from vggtjax.storage.markdown import markdown_table
 from vggtjax.storage.memory import peak_bytes
 
 _YES = {True: "yes", False: "**no**"}
@@ -23,13 +24,15 @@ _YES = {True: "yes", False: "**no**"}
 def page(facts: Mapping[str, str], found: Sequence[Check], parity: Sequence[Parity]) -> str:
     """Return the check as Markdown; without `parity`, none was asked for."""
     parts = [
-        _table(("model", "value"), facts.items()),
-        _table(("check of the model alone", "found", "holds"), ((c.name, c.found, _YES[c.holds]) for c in found)),
+        markdown_table(("model", "value"), facts.items()),
+        markdown_table(
+            ("check of the model alone", "found", "holds"), ((c.name, c.found, _YES[c.holds]) for c in found)
+        ),
     ]
     if parity:
         rows = ((p.name, f"{p.spreads:.1e}", f"{p.largest:.1e}", p.tolerance, _YES[p.holds]) for p in parity)
         heading = ("output beside the public code", "error, std", "largest error", "tolerance", "holds")
-        parts.append(_table(heading, rows))
+        parts.append(markdown_table(heading, rows))
     return "\n".join(parts)
 
 
@@ -78,8 +81,3 @@ def _digest(path: Path) -> str:
 
 def _gigabytes(size: int | None) -> str:
     return "unknown" if size is None else f"{size / 1e9:.2f} GB"
-
-
-def _table(heading: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    lines = [heading, ["---"] * len(heading), *rows]
-    return "".join(f"| {' | '.join(cell.replace('|', '/') for cell in line)} |\n" for line in lines)

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from vggtjax.results.exports.views import View, of_one_size
-from vggtjax.results.gltf_animation import frame_times
+from vggtjax.results.gltf_animation import frame_rate
 from vggtjax.results.point_cloud import PointCloud, write_ply
 from vggtjax.results.result import Result
 from vggtjax.results.shown import middle_and_radius
@@ -52,7 +52,7 @@ def write_blender(
         "name": "vggtjax",
         "width": size[1],
         "height": size[0],
-        "frames_a_second": 1 / float(np.median(np.diff(frame_times(result)))),
+        "frames_a_second": frame_rate(result),
         "near": _NEAR * distance,
         "far": _FAR * distance,
         "point_radius": _spacing(static) / 2,

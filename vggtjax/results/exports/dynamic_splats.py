@@ -20,7 +20,7 @@ from PIL import Image
 
 from vggtjax.results.exports.nerfstudio import lens_of, transform_matrix
 from vggtjax.results.exports.views import View, of_one_size
-from vggtjax.results.gltf_animation import frame_times
+from vggtjax.results.gltf_animation import frame_rate, frame_times
 from vggtjax.results.point_cloud import PointCloud, ply_header, write_ply
 from vggtjax.results.result import Result
 
@@ -134,8 +134,7 @@ def _write_scene(
     far = _FAR * float(ends[:, 1].max()) * scale
     near = min(_NEAR * float(ends[:, 0].min()) * scale, far)
     _dump(folder / "scene.json", {"scale": scale, "center": center.tolist(), "near": near, "far": far})
-    times = frame_times(result)
-    extra = {"factor": 1, "fps": 1 / float(np.median(np.diff(times))), "bbox": ((box - center) * scale).tolist()}
+    extra = {"factor": 1, "fps": frame_rate(result), "bbox": ((box - center) * scale).tolist()}
     _dump(folder / "extra.json", extra | {"lookat": [0.0] * 3, "up": (up / max(np.linalg.norm(up), 1e-12)).tolist()})
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from vggtjax.results.colors import LINEAR
 from vggtjax.results.exports.views import View, placed
 
 
@@ -20,15 +21,10 @@ def write_exr(folder: Path, items: Iterator[View]) -> None:
 
     for view in items:
         frame = view.frame
-        channels = {name: _linear(frame.image[..., index]) for index, name in enumerate("RGB")}
+        channels = {name: LINEAR[frame.image[..., index]] for index, name in enumerate("RGB")}
         channels["Z"] = np.where(frame.valid, frame.depth, 0).astype(np.float32)
         channels["confidence"] = frame.confidence.astype(np.float32)
         if view.has_mask:
             channels["moving"] = frame.dynamic_mask.astype(np.float32)
         header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
         OpenEXR.File(header, channels).write(str(placed(folder, f"{Path(view.name).with_suffix('')}.exr")))
-
-
-def _linear(values: np.ndarray) -> np.ndarray:
-    share = values.astype(np.float32) / 255
-    return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4).astype(np.float32)

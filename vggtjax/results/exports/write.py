@@ -69,8 +69,6 @@ def export_result(
     """
     out = Path(out)
     check_export(out, form)
-    if out.is_dir():
-        out.rmdir()
     with writing(out) as path:
         if not FORMATS[form].suffixes:
             path.mkdir()
@@ -80,6 +78,8 @@ def export_result(
             say_renamed(path, wanted, names)
         items = _counted(views(result, source, names), len(result.depth), progress)
         _write(result, path, form, items, exporting, progress)
+        if out.is_dir():  # and empty, as it was checked; Windows renames nothing onto a folder
+            out.rmdir()
 
 
 def _write(

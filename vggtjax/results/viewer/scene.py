@@ -15,7 +15,8 @@ from vggtjax.cameras import frustum_corners
 from vggtjax.errors import one_line
 from vggtjax.progress import Progress
 from vggtjax.results.colors import hues
-from vggtjax.results.frame import PLAIN_RATE, frame_of
+from vggtjax.results.frame import frame_of
+from vggtjax.results.gltf_animation import frame_rate
 from vggtjax.results.result import Result
 from vggtjax.results.shown import ShownPoints, middle_and_radius, relative_steps, shown_points
 from vggtjax.results.tracks import SEEN
@@ -80,7 +81,7 @@ def scene_of(
         "facts": _facts(result),
         "note": one_line(result.model_note),
         "frames": S,
-        "rate": frame_rate(result),
+        "rate": playing_rate(result),
         "times": None if result.timestamps is None else (result.timestamps - result.timestamps[0]).tolist(),
         "centre": centre.tolist(),
         "scale": radius,
@@ -117,12 +118,9 @@ def _facts(result: Result) -> str:
     return one_line(f"{result.method} · {result.model_name} · {frames}{moving}")
 
 
-def frame_rate(result: Result) -> float:
-    """Return frames a second."""
-    if result.timestamps is None or len(result.timestamps) < 2:
-        return PLAIN_RATE
-    step = float(np.median(np.diff(result.timestamps)))
-    return float(np.clip(1 / step, 0.5, 60)) if step > 0 else PLAIN_RATE
+def playing_rate(result: Result) -> float:
+    """Return frames a second, at least one in two seconds and at most 60."""
+    return float(np.clip(frame_rate(result), 0.5, 60))
 
 
 def _shown_widths(result: Result, static: ShownPoints, moving: list[ShownPoints]) -> list[Float32[np.ndarray, " N"]]:

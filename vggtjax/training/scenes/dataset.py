@@ -24,6 +24,7 @@ from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 
 from vggtjax.cameras import world_from_camera
+from vggtjax.clips.media.arrays import in_bytes
 from vggtjax.errors import InputError, OutputError, check_choice, one_line
 from vggtjax.progress import Progress, no_progress
 from vggtjax.results.export import encode_depth, write_intrinsics
@@ -232,7 +233,7 @@ def _write_index(out: Path, index: dict[str, Any]) -> None:
 
 
 def _files_of(clip: SyntheticClip) -> SceneFiles:
-    pictures = np.rint(255 * clip.images).astype(np.uint8)
+    pictures = in_bytes(np.asarray(clip.images))
     parts, cameras = np.asarray(clip.part_ids, np.uint8), (clip.camera_from_world, clip.intrinsics)
     return SceneFiles(pictures, clip.depth, clip.dynamic_mask, parts, clip.scene_flow, *cameras, clip.world_from_part)  # pyright: ignore
 

@@ -28,6 +28,7 @@ LAYER_SHARE = 0.03
 MOVERS = (0.03, 0.30)  # range of the share of moving pixels, averaged over the frames
 SIZE = 48  # pixels of the images that scenes are selected by, whatever the size of the images returned
 _AT_ONCE = 16
+_MOST_CANDIDATES = 1000  # for each scene; of the default config one in three or four is hard enough
 
 
 class Hardness(NamedTuple):
@@ -62,7 +63,7 @@ def held_out_scenes(
         progress: called with the number of scenes selected and rendered, and of both: 2 x `count`.
 
     Raises:
-        InputError: an unknown kind, a count below 1, or fewer than 12 frames.
+        InputError: an unknown kind, a count below 1, fewer than 12 frames, or a config with hardly any hard scene.
     """
     check_choice("kind of scenes", kind, get_args(Kind))
     count = whole_number("count of scenes", count, 1)
@@ -120,6 +121,11 @@ def _hard_keys(kind: Kind, count: int, config: SceneConfig, seed: int, textures:
     stream = jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), STREAM), get_args(Kind).index(kind))
     selected, candidate = [], 0
     while len(selected) < count:
+        if candidate >= _MOST_CANDIDATES * (1 + len(selected)):
+            raise InputError(
+                f"{len(selected)} of {candidate} {kind} scenes are hard enough for a test, and {count} are wanted; "
+                "choose a config whose cameras move farther"
+            )
         keys = jax.vmap(lambda i: jax.random.fold_in(stream, i))(jax.numpy.arange(candidate, candidate + _AT_ONCE))
         hard = hardness(jax.device_get(_generate(keys, textures, small))).kept(kind)
         selected += [keys[i] for i in np.flatnonzero(hard)]

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 from PIL import Image
 
+from vggtjax.clips.media.arrays import in_bytes
 from vggtjax.errors import check_choice
 from vggtjax.training.scenes.config import Split
 from vggtjax.training.scenes.pyramid import texels
@@ -110,4 +111,4 @@ def _procedural(generator: np.random.Generator, kind: int) -> UInt8[np.ndarray, 
     mix = np.clip(0.75 * pattern + 0.25 * noise, 0, 1)[..., None]
     first, second = generator.random((2, 3))
     colour = mix * first + (1 - mix) * second
-    return np.rint(255 * np.clip(colour, 0, 1)).astype(np.uint8)
+    return in_bytes(np.clip(colour, 0, 1))

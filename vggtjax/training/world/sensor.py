@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
+from vggtjax.clips.media.arrays import in_bytes
 from vggtjax.training.world.config import WorldConfig
 from vggtjax.training.world.motion import wander
 
@@ -28,7 +29,7 @@ def expose(
     pictures = light * exposure[:, None, None].astype(np.float32) * corner[..., None]
     grain = generator.uniform(0, config.noise)
     pictures = pictures + generator.standard_normal(pictures.shape, np.float32) * np.asarray(grain, np.float32)
-    pictures = np.rint(255 * np.clip(pictures, 0, 1)).astype(np.uint8)
+    pictures = in_bytes(np.clip(pictures, 0, 1))
     if generator.random() < config.compression:
         quality = int(generator.integers(35, 95))
         pictures = np.stack([_compressed(picture, quality) for picture in pictures])

@@ -41,7 +41,8 @@ def fbms(root: Path) -> dict[str, Opener]:
 def _read_fbms(folder: Path, name: str, frames: FrameChoice) -> LabelledSequence:
     every, pictures = _pictures(folder, frames, name)
     objects, labelled = _definition(next((folder / _TRUTH).glob("*.dat")), len(every))
-    paths = [labelled.get(every.index(path)) for path in pictures]
+    order = {path: number for number, path in enumerate(every)}
+    paths = [labelled.get(order[path]) for path in pictures]
     unlabelled = [path.stem for path, label in zip(pictures, paths, strict=True) if label is None]
     if len(unlabelled) == len(pictures):
         raise InputError(f"none of {len(pictures)} frames of sequence {name} has labels; take more of its frames")

@@ -186,7 +186,8 @@ def _known_poses(folder: Path, pictures: list[Path]) -> _Known:
     if (timed := _by_time(folder, pictures)) is not None:
         rows = timed
     elif len(every := in_order({*stems, *named[0], *named[1]}, Path)) == len(poses):
-        rows = [every.index(stem) for stem in stems]
+        order = {stem: row for row, stem in enumerate(every)}
+        rows = [order[stem] for stem in stems]
     else:
         rows = _counted(stems, len(poses))
     taken = np.full((len(pictures), 4, 4), np.nan)

@@ -36,10 +36,11 @@ def scene_tracks(
     parts, depths = files(folder / "parts", ".png"), files(folder / "depth", ".npy")
     if not (folder / "part_poses.npy").is_file() or not all(name in parts and name in depths for name in names):
         return None
-    moved, numbers = read_array(folder / "part_poses.npy").astype(np.float64), [*parts]
+    moved = read_array(folder / "part_poses.npy").astype(np.float64)
+    numbers = {name: number for number, name in enumerate(parts)}
     if moved.ndim != 4 or moved.shape[2:] != (3, 4) or len(moved) != len(numbers):
         raise InputError(f"{folder / 'part_poses.npy'} has shape {moved.shape}; expected [{len(numbers)}, K, 3, 4]")
-    rows = [numbers.index(name) for name in names]
+    rows = [numbers[name] for name in names]
     cameras = world_from_camera(poses[:, :3])[:, :3]
     first, depth = _labels(parts[names[0]]), read_npy(depths[names[0]])
     y, x = (

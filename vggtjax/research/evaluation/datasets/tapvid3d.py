@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 
-from vggtjax.cameras import checked_poses
 from vggtjax.clips.captures.cameras import checked_intrinsics, world_from_camera_of
 from vggtjax.clips.captures.files import files
 from vggtjax.clips.captures.pictures import picture_size
@@ -82,7 +81,7 @@ def _read(path: Path, name: str, frames: FrameChoice) -> LabelledSequence:
     visible, notes = seen_inside(places, visible, width, height, path)
     cameras = np.tile(np.eye(3, 4), (len(visible), 1, 1))
     if "extrinsics_w2c" in arrays:
-        cameras = checked_poses(arrays["extrinsics_w2c"][:, :3])
+        cameras = arrays["extrinsics_w2c"][:, :3]
     poses = world_from_camera_of(cameras, path)
     points = np.einsum("sij,snj->sni", poses[:, :3, :3], in_camera) + poses[:, None, :3, 3]
     tracks = TrueTracks(points, visible).of_frames(taken)
