@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -39,8 +40,9 @@ class Worker:
 
     def run(self, *, keep: str | None = None, mask: str | None = None, **task: Any) -> Answer:
         """Run passes; return the worker's answer: seconds, bytes of memory, reads of a disk."""
-        self._process.stdin.write(json.dumps({**task, "keep": keep, "mask": mask}) + "\n")
-        self._process.stdin.flush()
+        with suppress(BrokenPipeError):  # an ended process; `_answer` says so
+            self._process.stdin.write(json.dumps({**task, "keep": keep, "mask": mask}) + "\n")
+            self._process.stdin.flush()
         return self._answer()
 
     def __enter__(self) -> Worker:

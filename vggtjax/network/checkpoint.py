@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, Literal, NamedTuple, NoReturn
+from typing import Annotated, Any, Literal, NoReturn
 
 import jax
 import numpy as np
@@ -26,6 +26,7 @@ from vggtjax.network.kernels.quantised import Halves, Quantised, halves, is_quan
 from vggtjax.network.layers import Params
 from vggtjax.network.model import parameter_shapes
 from vggtjax.storage.backend import backend
+from vggtjax.storage.file_digest import FileFacts, content_digest, file_facts
 from vggtjax.storage.json_values import parse_json
 from vggtjax.storage.kept_text import kept_text
 from vggtjax.storage.tensor_file import Spec, is_tensor_file, read_tensors, write_tensors
@@ -68,14 +69,14 @@ class Model:
     revision: str = ""  # commit of the source files on the hub; empty if they are not from there
     untrained_heads: tuple[str, ...] = ()  # heads with random parameters
     note: str = ""  # for users of the model; part of the settings of its results
-    _file: _FileFacts | None = field(default=None, init=False, repr=False)  # `dataclasses.replace` forgets both
+    _file: FileFacts | None = field(default=None, init=False, repr=False)  # `dataclasses.replace` forgets both
     _wide: Callable[[], Model] | None = field(default=None, init=False, repr=False)
 
     @cached_property
     def identity(self) -> ModelIdentity:
         """Name and digest of the model; the first use reads all parameters, or their file."""
-        in_file = self._file is not None and self._file == _file_facts(self._file.path)
-        return ModelIdentity(self.name, _file_digest(self._file) if in_file else _params_digest(self.widened()))
+        in_file = self._file is not None and self._file == file_facts(self._file.path)
+        return ModelIdentity(self.name, content_digest(self._file) if in_file else _params_digest(self.widened()))
 
     def widened(self) -> Model:
         """Return the model as it is without weights in the type of the products: on the host, read again."""
@@ -166,7 +167,7 @@ def read_model(
     this library that fits its own configuration.
     """
     path, platform = Path(path), backend()
-    facts = _file_facts(path)
+    facts = file_facts(path)
     tensors, metadata = read_tensors(path)
     config, stored_fields = _read_metadata(path, metadata)
     check_parameters(f"{path} does not fit its own configuration", tensors, config)
@@ -324,34 +325,6 @@ def _check_labels(path: Path, note: str, untrained_heads: Sequence[str], config:
         raise CheckpointError(f"the note of {path} is {note[:50]!r}; expected up to 200 printable letters")
     if unknown := [head for head in untrained_heads if head not in config.heads]:
         raise CheckpointError(f"{path} names the untrained heads {unknown}; expected some of {config.heads}")
-
-
-class _FileFacts(NamedTuple):
-    """Facts that change when the content of a file changes."""
-
-    path: Path
-    size: int
-    modified: int  # nanoseconds
-    inode: int
-
-
-def _file_facts(path: Path) -> _FileFacts | None:
-    try:
-        stat = path.stat()
-        return _FileFacts(path.resolve(), stat.st_size, stat.st_mtime_ns, stat.st_ino)
-    except OSError:
-        return None
-
-
-@lru_cache(maxsize=64)
-def _file_digest(facts: _FileFacts) -> str:
-    """Return the sha256 of a file, computed once and kept: hashing 5 GB takes seconds."""
-
-    def digest() -> str:
-        with facts.path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-
-    return kept_text(f"sha256 {facts}", digest)
 
 
 def _params_digest(model: Model) -> str:

@@ -57,7 +57,7 @@ from PIL.PngImagePlugin import PngInfo
 
 from vggtjax.errors import InputError, one_line
 from vggtjax.progress import Progress, no_progress
-from vggtjax.results import foreign, previews, tracks
+from vggtjax.results import previews, tracks, vggt4d_files
 from vggtjax.results.frame import LeastConfidence, ResultFrame, frame_of
 from vggtjax.results.glb import glb_bytes, result_scene
 from vggtjax.results.gltf_animation import add_camera
@@ -109,7 +109,7 @@ def write_files(
     if saving.writes("cameras"):
         _write_cameras(result, written, folder)
     if saving.format == "vggt4d":
-        foreign.write_cameras(folder / "vggt4d", result.world_from_camera, [frame.intrinsics for frame in written])
+        vggt4d_files.write_cameras(folder / "vggt4d", result.world_from_camera, [frame.intrinsics for frame in written])
     if saving.writes("scene"):
         scene = result_scene(result, saving.confidence_percentile)
         (folder / "scene.glb").write_bytes(glb_bytes(scene, partial(add_camera, result)))
@@ -246,7 +246,7 @@ def _frame_writer(
             write_ply(folder / f"frames/{name}.ply", frame_cloud(frame, pixels))
             cloud = frame_cloud(frame, pixels & ~frame.dynamic_mask)
         if saving.format == "vggt4d":
-            foreign.write_frame(folder / "vggt4d", number, frame, mask=has_mask)
+            vggt4d_files.write_frame(folder / "vggt4d", number, frame, mask=has_mask)
         return _Written((frame.depth.shape[0], frame.depth.shape[1]), frame.intrinsics), cloud
 
     return write_frame

@@ -1,4 +1,4 @@
-"""Result folders of other programs: VGGT4D's written and read; those of seven others read.
+"""Result folders of other programs, read: VGGT4D's (`vggt4d_files` writes it) and those of seven others.
 
 Files and units are those of their public code:
 
@@ -28,41 +28,20 @@ from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
 import numpy as np
-from jaxtyping import Float, Float32
-from PIL import Image
+from jaxtyping import Float32
 
 from vggtjax.cameras import Cameras, world_from_camera
 from vggtjax.clips.masks import read_mask
 from vggtjax.clips.media.images import read_image
 from vggtjax.errors import InputError, ResultError, check_choice, reading
 from vggtjax.results.foreign_cameras import Posed, text_cameras
-from vggtjax.results.frame import ResultFrame
 from vggtjax.storage.arrays import SIZE_LIMIT, Header, read_array, read_arrays, read_headers
-from vggtjax.storage.trajectories import Quaternion, write_trajectory
+from vggtjax.storage.trajectories import Quaternion
 
 _WHITE = 1.01  # of shares, with rounding
 _GREY = 128  # of pictures that a format does not keep
 
 logger = logging.getLogger(__name__)
-
-
-def write_frame(folder: Path, number: int, frame: ResultFrame, *, mask: bool = True) -> None:
-    """Write a frame as VGGT4D does, with its mask if there is one."""
-    Image.fromarray(frame.image).save(folder / f"frame_{number:04d}.png")
-    np.save(folder / f"frame_{number:04d}.npy", frame.depth, allow_pickle=False)
-    np.save(folder / f"conf_{number:04d}.npy", frame.confidence, allow_pickle=False)
-    if mask:
-        moving = Image.fromarray(frame.dynamic_mask.astype(np.uint8) * 255)
-        moving.save(folder / f"dynamic_mask_{number:04d}.png")
-
-
-def write_cameras(
-    folder: Path, world_from_camera: Float[np.ndarray, "S 4 4"], intrinsics: Sequence[Float[np.ndarray, "3 3"]]
-) -> None:
-    """Write the cameras as VGGT4D does."""
-    np.savetxt(folder / "pred_intrinsics.txt", np.stack(intrinsics).reshape(-1, 9), fmt="%.9g")
-    numbers = np.arange(len(world_from_camera), dtype=np.float64)
-    write_trajectory(folder / "pred_traj.txt", world_from_camera, numbers, quaternion="wxyz")
 
 
 class _Folder(NamedTuple):

@@ -10,8 +10,9 @@ from PIL import Image
 
 from vggtjax.cameras import unproject
 from vggtjax.errors import InputError, check_choice
-from vggtjax.results.result import Result, inside_box, show_points
+from vggtjax.results.result import Result
 from vggtjax.results.saving import Resolution
+from vggtjax.results.visible import inside_box, show_points
 
 PLAIN_RATE = 10.0  # frames a second of clips without times
 SAME_SURFACE = 0.05  # relative difference in depth up to which neighbours belong to one surface

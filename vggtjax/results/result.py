@@ -12,12 +12,13 @@ from functools import cached_property
 from typing import Any, TypeVar, get_args, get_type_hints
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int, Int64, UInt8
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from vggtjax.cameras import FIELD_OF_VIEW_RANGE, camera_centres, clamp_intrinsics, unproject, world_from_camera
 from vggtjax.errors import ResultError
 from vggtjax.options import METHODS
 from vggtjax.results.instances import find_instances
+from vggtjax.results.visible import inside_box, show_points
 from vggtjax.storage.arrays import is_mapped, zeros_beside
 
 _TIME = re.compile(r"\d{1,18}\.\d{1,18}")  # in seconds, as a frame's name
@@ -306,20 +307,6 @@ def without_mask(result: AnyResult) -> AnyResult:
     settings = result.settings | {"masks": f"none: {result.method} makes no mask"}
     nothing = np.zeros(result.dynamic_mask.shape, bool)
     return replace(result, dynamic_mask=nothing, saliency=None, motion=None, settings=settings)
-
-
-def inside_box(box: Int[np.ndarray, "*F 4"], size: tuple[int, ...]) -> Bool[np.ndarray, "*F H W"]:
-    """Return the pixels of a picture of this height and width that lie in a box of left, top, right, bottom."""
-    rows, columns = np.arange(size[0])[:, None], np.arange(size[1])
-    left, top, right, bottom = np.moveaxis(box, -1, 0)[..., None, None]
-    return (left <= columns) & (columns < right) & (top <= rows) & (rows < bottom)
-
-
-def show_points(
-    depth: Float32[np.ndarray, "*F H W"], confidence: Float32[np.ndarray, "*F H W"], seen: Bool[np.ndarray, "*F H W"]
-) -> Bool[np.ndarray, "*F H W"]:
-    """Return the seen pixels with a finite depth above 0 and a finite confidence."""
-    return seen & np.isfinite(depth) & (depth > 0) & np.isfinite(confidence)
 
 
 def check_shapes(shapes: Mapping[str, tuple[int, ...]]) -> None:

@@ -42,15 +42,8 @@ class GivenInputs:
 
     def check(self, recipe: ClipRecipe, windows: Windows) -> None:
         """Raise InputError for missing files, for options that need mined masks, and for those that exclude others."""
-        if windows.window and recipe.devices > 1:
-            raise InputError("--devices and --window exclude each other: a window is run on one device")
-        if windows.window and recipe.known:
-            raise InputError(
-                "known cameras or lengths and --window exclude each other: they are brought into a clip "
-                "that is run as a whole"
-            )
-        if windows.window and recipe.options.refine_cameras:
-            raise InputError("--refine-cameras and --window exclude each other: cameras are adjusted over all frames")
+        for name, reason in recipe.needs_all_frames.items() if windows.window else ():
+            raise InputError(f"{name} and --window exclude each other: {reason}")
         if self.tracks is not None and recipe.devices > 1:
             raise InputError("--devices and --tracks exclude each other: points are followed on one device")
         if self.masks is not None or self.no_masks:

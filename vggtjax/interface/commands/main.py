@@ -26,7 +26,7 @@ from vggtjax.interface.commands.app import app
 from vggtjax.interface.commands.batch import batch
 from vggtjax.interface.commands.calibrate_cues import calibrate_cues
 from vggtjax.interface.commands.check_weights import check_weights
-from vggtjax.interface.commands.convert import convert, import_result, info
+from vggtjax.interface.commands.convert import convert
 from vggtjax.interface.commands.demo import demo
 from vggtjax.interface.commands.doctor import doctor
 from vggtjax.interface.commands.evaluate import evaluate
@@ -34,6 +34,8 @@ from vggtjax.interface.commands.export import export
 from vggtjax.interface.commands.extend import extend
 from vggtjax.interface.commands.fit_fusion import fit_fusion
 from vggtjax.interface.commands.flags import REGISTRY
+from vggtjax.interface.commands.import_result import import_result
+from vggtjax.interface.commands.info import info
 from vggtjax.interface.commands.reconstruct import reconstruct
 from vggtjax.interface.commands.render import render
 from vggtjax.interface.commands.scenes import scenes

@@ -59,14 +59,14 @@ class ClipRecipe:
     saving: Saving = Saving()
 
     @property
-    def needs_all_frames(self) -> list[str]:
-        """The options that need all frames at once, so that a clip is not run in windows."""
+    def needs_all_frames(self) -> dict[str, str]:
+        """The given options that need all frames at once, so that a clip is not run in windows, and why."""
         needs = {
-            "--devices": self.devices > 1,
-            "known cameras or lengths": self.known,
-            "--refine-cameras": self.options.refine_cameras,
+            "--devices": (self.devices > 1, "a window is run on one device"),
+            "known cameras or lengths": (self.known, "they are brought into a clip that is run as a whole"),
+            "--refine-cameras": (self.options.refine_cameras, "cameras are adjusted over all frames"),
         }
-        return [name for name, given in needs.items() if given]
+        return {name: reason for name, (given, reason) in needs.items() if given}
 
     def changed(self, **changes: Any) -> Self:
         """Return the recipe with other values, by the names of its fields or of fields of its parts, such as `fps`.

@@ -17,7 +17,8 @@ from jaxtyping import Array, Bool, Float, Float32
 
 from vggtjax.method.matching.matches import frame_pairs
 from vggtjax.network.precision import full_precision
-from vggtjax.results.result import Result, inside_box, show_points
+from vggtjax.results.result import Result
+from vggtjax.results.visible import inside_box, show_points
 
 _TIMES = 4.0  # the tolerance is so many median differences between frames
 _TOLERANCE = (0.01, 0.2)  # of log depth: its range

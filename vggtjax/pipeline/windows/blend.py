@@ -15,7 +15,8 @@ from jaxtyping import Bool, Float32, Float64
 from scipy.spatial.transform import Rotation
 
 from vggtjax.cameras import Similarity, align, checked_centres
-from vggtjax.results.result import Result, inside_box, show_points
+from vggtjax.results.result import Result
+from vggtjax.results.visible import inside_box, show_points
 
 
 class WindowView(NamedTuple):

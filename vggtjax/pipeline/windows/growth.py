@@ -22,7 +22,8 @@ from vggtjax.pipeline.windows.join import Join, join_windows, reach_of
 from vggtjax.pipeline.windows.overlap import Places, choose_anchors, unconnected
 from vggtjax.pipeline.windows.plan import FEWEST_ANCHORS
 from vggtjax.results.reconstruction import Reconstruction
-from vggtjax.results.result import ARRAYS, TRACKS, show_points
+from vggtjax.results.result import ARRAYS, TRACKS
+from vggtjax.results.visible import show_points
 
 _LEAST_STATIC = 0.02  # share of a frame's pixels; with less, an anchor says nothing of where it is
 _WORST = 0.2  # residual of a join, relative to depth; with more, anchors and new frames do not fit together

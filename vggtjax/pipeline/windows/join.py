@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from vggtjax.cameras import Similarity, camera_centres, umeyama_sim3, unproject
-from vggtjax.results.result import Result, inside_box, show_points
+from vggtjax.results.result import Result
+from vggtjax.results.visible import inside_box, show_points
 
 _PERCENTILE = 30.0  # percent of the pixels to leave out, the least confident of each window
 _CAMERA_SHARE = 0.2  # of all weight: the cameras'; the pixels have the rest

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from vggtjax.clips.captures.files import folder_name
+from vggtjax.clips.captures.files import files, folder_name
 from vggtjax.clips.media.order import in_order
 from vggtjax.errors import InputError
 
@@ -45,6 +45,13 @@ def subfolders(folder: Path) -> list[Path]:
     except OSError as error:
         raise InputError(f"cannot read {folder}: {error.strerror}; check its permissions") from error
     return in_order(children)
+
+
+def pictures_of(folder: Path, ending: str) -> list[Path]:
+    """Return the pictures of a sequence in natural order; raises InputError where there are none."""
+    if pictures := list(files(folder, ending).values()):
+        return pictures
+    raise InputError(f"the sequence has no pictures; expected {folder / f'*{ending}'}")
 
 
 def listed(names: list[str]) -> str:

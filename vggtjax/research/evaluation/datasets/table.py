@@ -13,10 +13,11 @@ from vggtjax.clips.media.sampling import Sampling
 from vggtjax.errors import InputError, reading
 from vggtjax.research.evaluation.datasets import published
 from vggtjax.research.evaluation.datasets.captures import captures
+from vggtjax.research.evaluation.datasets.davis import davis
 from vggtjax.research.evaluation.datasets.dycheck import TRUTHS, dycheck
 from vggtjax.research.evaluation.datasets.folders import listed
 from vggtjax.research.evaluation.datasets.frames_list import Pinned, PinnedError, listed_sequences, read_frames_list
-from vggtjax.research.evaluation.datasets.layouts import davis, kitti, seven_scenes, sintel
+from vggtjax.research.evaluation.datasets.kitti import kitti
 from vggtjax.research.evaluation.datasets.motion_masks import fbms, segtrack
 from vggtjax.research.evaluation.datasets.plain import plain
 from vggtjax.research.evaluation.datasets.sequence import (
@@ -26,6 +27,8 @@ from vggtjax.research.evaluation.datasets.sequence import (
     Reader,
     refuse_left_out,
 )
+from vggtjax.research.evaluation.datasets.seven_scenes import seven_scenes
+from vggtjax.research.evaluation.datasets.sintel import sintel
 from vggtjax.research.evaluation.datasets.spatialbench import spatialbench
 from vggtjax.research.evaluation.datasets.tapvid3d import tapvid3d
 from vggtjax.research.evaluation.datasets.tum import bonn, tum
