@@ -14,7 +14,7 @@ from typing import NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from vggtjax.cameras import Cameras
 from vggtjax.method.matching.matches import frame_pairs, patch_centres
@@ -54,6 +54,24 @@ class Static(NamedTuple):
     focal: Float[Array, ""]  # factor of all focal lengths
     information: Float[Array, "S P"]  # inverse variance of each log depth by the matches alone, cameras given
     pull: Float[Array, "S P"]  # what the matches alone would add to each log depth, against its prior
+
+
+class _Problem(NamedTuple):
+    """What does not change while cameras and depths are adjusted."""
+
+    matched: Float[Array, "S M P 2"]
+    weight: Float[Array, "S M P"]
+    mean: Float[Array, "S P"]  # of the prior of the log inverse depths
+    focal: Float[Array, "S 1 2"]
+    centre: Float[Array, "S 1 2"]
+    others: Int[np.ndarray, "S M"]  # frames that see the patches of each
+    grid: tuple[int, int]
+    how: Adjustment
+
+    @property
+    def seen_by(self) -> Int[np.ndarray, "S N"]:
+        """The cameras that a patch connects: its own frame's first, N = M + 1."""
+        return np.concatenate([np.arange(len(self.others))[:, None], self.others], axis=1)
 
 
 class _State(NamedTuple):
@@ -114,97 +132,106 @@ def adjust(
         how: priors, loss and iterations.
         prior_depth: the mean of the prior of `depth`; `depth` itself if None.
     """
-    S, P = depth.shape
+    S = len(depth)
     prior_depth = depth if prior_depth is None else prior_depth
     (depth, cameras, matched, weight) = jax.tree.map(jnp.asarray, (depth, cameras, matched, weight))
     unit = jnp.median(prior_depth)
-    mean = -jnp.log(prior_depth / unit)
     K = cameras.intrinsics
     focal, centre = K[:, [0, 1], [0, 1]][:, None], K[:, :2, 2][:, None]
-    others = frame_pairs(S).others
-    seen_by = np.concatenate([np.arange(S)[:, None], others], axis=1)  # [S, M + 1], the cameras that a patch connects
-    prior = jnp.repeat(jnp.array([how.rotation_prior, how.translation_prior], K.dtype) ** -2.0, 3)
-
-    def seen(state: _State, sigma: Array, s: Array) -> _Seen:
-        inverse, to, factor = jnp.exp(state.log_inverse[s]), jnp.asarray(others)[s], jnp.exp(state.log_focal)
-        turn = jnp.einsum("mij,kj->mik", state.rotation[to], state.rotation[s])
-        shift = state.translation[to] - jnp.einsum("mij,j->mi", turn, state.translation[s])
-        rays = jnp.concatenate(
-            [(patch_centres(grid) - centre[s]) / (focal[s] * factor), jnp.ones((P, 1), K.dtype)], axis=-1
-        )
-        points = jnp.einsum("mij,pj->mpi", turn, rays) + inverse[None, :, None] * shift[:, None]
-        position = points[..., :2] / jnp.maximum(points[..., 2:], _NEAREST) * (focal[to] * factor) + centre[to]
-        error = position - matched[s]
-        slope = _slope_of_projection(points, focal[to] * factor)
-        by_depth = jnp.einsum("mpij,mj->mpi", slope, shift) * inverse[None, :, None]
-        loss = (1 + jnp.sum(error * error, axis=-1) / sigma**2) ** -2
-        w = jnp.where(points[..., 2] > _IN_FRONT, weight[s] * loss / how.sigma**2, 0)
-        return _Seen(rays, turn, points, position, error, slope, by_depth, w)
-
-    def equations(state: _State, sigma: Array, s: Array) -> _Equations:
-        rays, turn, points, position, error, slope, by_depth, w = seen(state, sigma, s)
-        inverse = jnp.exp(state.log_inverse[s])
-        by_other = slope @ _slope_of_motion(points, inverse)
-        by_own = -slope @ jnp.einsum("mij,pjk->mpik", turn, _slope_of_motion(rays, inverse))
-        depth_curvature = jnp.einsum("mp,mpi->p", w, by_depth**2) + how.depth_prior**-2
-        depth_slope = jnp.einsum("mp,mpi,mpi->p", w, by_depth, error)
-        depth_slope += (state.log_inverse[s] - mean[s]) * how.depth_prior**-2
-        own, other = w[..., None, None] * by_own, w[..., None, None] * by_other
-        corner, between = jnp.einsum("mpia,mpib->ab", own, by_own), jnp.einsum("mpia,mpib->mab", own, by_other)
-        blocks = _local_blocks(corner, between, jnp.einsum("mpia,mpib->mab", other, by_other))
-
-        def with_cameras(values: Float[Array, "M P 2"]) -> Float[Array, "N 6"]:
-            by_cameras = jnp.einsum("mpia,mpi->a", own, values)[None], jnp.einsum("mpia,mpi->ma", other, values)
-            return jnp.concatenate(by_cameras)
-
-        gradient = with_cameras(error)
-        cross_own = jnp.einsum("mpia,mpi->pa", own, by_depth)[:, None]
-        cross = jnp.concatenate([cross_own, jnp.einsum("mpia,mpi->pma", other, by_depth)], axis=1)
-        blocks -= jnp.einsum("pma,pnb->mnab", cross / depth_curvature[:, None, None], cross)
-        gradient -= jnp.einsum("pma,p->ma", cross, depth_slope / depth_curvature)
-        if how.focal_prior is None:
-            none = jnp.zeros((), gradient.dtype)
-            of_focal = (jnp.zeros(P, gradient.dtype), jnp.zeros_like(gradient), none, none)
-        else:  # a longer focal length turns the ray inwards, and moves the position outwards
-            inwards = jnp.einsum("mpij,mjk,pk->mpi", slope, turn, rays * np.array([[-1.0, -1, 0]], np.float32))
-            by_focal = inwards + position - centre[jnp.asarray(others)[s]]
-            weighted = w[..., None] * by_focal
-            focal_cross = jnp.einsum("mpi,mpi->p", weighted, by_depth)
-            of_focal = (
-                focal_cross,
-                with_cameras(by_focal) - jnp.einsum("pma,p->ma", cross, focal_cross / depth_curvature),
-                jnp.sum(weighted * by_focal) - jnp.sum(focal_cross**2 / depth_curvature),
-                jnp.sum(weighted * error) - jnp.sum(focal_cross * depth_slope / depth_curvature),
-            )
-        return _Equations(blocks, gradient, cross, depth_curvature, depth_slope, *of_focal)
-
-    def step(state: _State, sigma: Array) -> tuple[_State, None]:
-        of = _of_frames(lambda s: equations(state, sigma, s), S, P * others.shape[1])
-        change, by_focal = _change(of, seen_by, prior, state, how)
-        deeper = of.depth_slope + jnp.einsum("spma,sma->sp", of.cross, change[seen_by]) + of.focal_cross * by_focal
-        deeper = -deeper / of.depth_curvature
-        turned = quaternion_to_matrix(jnp.concatenate([change[:, :3] / 2, jnp.ones_like(change[:, :1])], axis=-1))
-        translation = jnp.einsum("sij,sj->si", turned, state.translation) + change[:, 3:]
-        log_inverse = state.log_inverse + jnp.clip(deeper, -_LARGEST_STEP, _LARGEST_STEP)
-        log_focal = state.log_focal + by_focal
-        return _State(turned @ state.rotation, translation, log_inverse, log_focal, state.moved + change), None
-
+    mean = -jnp.log(prior_depth / unit)
+    problem = _Problem(matched, weight, mean, focal, centre, frame_pairs(S).others, grid, how)
     rotation, translation = cameras.camera_from_world[..., :3], cameras.camera_from_world[..., 3] / unit
     still = jnp.concatenate([0 * translation, 0 * translation], axis=-1)  # on several devices, as the others are
     state = _State(rotation, translation, -jnp.log(depth / unit), 0 * unit, still)
-    state, _ = jax.lax.scan(step, state, how.sigma * jnp.array(how.annealed, K.dtype))
+    sigmas = how.sigma * jnp.array(how.annealed, K.dtype)
+    state, _ = jax.lax.scan(lambda state, sigma: (_step(problem, state, sigma), None), state, sigmas)
     last = jnp.asarray(how.sigma * (how.annealed or (1.0,))[-1], K.dtype)
-
-    def outcome(s: Array) -> tuple[Array, ...]:
-        world = seen(state, last, s)
-        information = jnp.einsum("mp,mpi->p", world.weight, world.by_depth**2)
-        pull = jnp.einsum("mp,mpi,mpi->p", world.weight, world.by_depth, world.error)
-        return world.position, world.points[..., 2], information, pull / jnp.maximum(information, _LEAST_INFORMATION)
-
-    position, in_front, information, pull = _of_frames(outcome, S, P * others.shape[1])
+    outcome = _of_frames(lambda s: _outcome(problem, state, last, s), problem)
     poses = jnp.concatenate([state.rotation, unit * state.translation[..., None]], axis=-1)
+    position, in_front, information, pull = outcome
     depth = unit * jnp.exp(-state.log_inverse)
     return Static(poses, depth, position, in_front, jnp.exp(state.log_focal), information, pull)
+
+
+def _seen(problem: _Problem, state: _State, sigma: Array, s: Array) -> _Seen:
+    """Return where a static world shows the patches of frame `s`; the loss is `sigma` wide."""
+    focal, centre, how = problem.focal, problem.centre, problem.how
+    inverse, to, factor = jnp.exp(state.log_inverse[s]), jnp.asarray(problem.others)[s], jnp.exp(state.log_focal)
+    turn = jnp.einsum("mij,kj->mik", state.rotation[to], state.rotation[s])
+    shift = state.translation[to] - jnp.einsum("mij,j->mi", turn, state.translation[s])
+    ones = jnp.ones((len(inverse), 1), focal.dtype)
+    rays = jnp.concatenate([(patch_centres(problem.grid) - centre[s]) / (focal[s] * factor), ones], axis=-1)
+    points = jnp.einsum("mij,pj->mpi", turn, rays) + inverse[None, :, None] * shift[:, None]
+    position = points[..., :2] / jnp.maximum(points[..., 2:], _NEAREST) * (focal[to] * factor) + centre[to]
+    error = position - problem.matched[s]
+    slope = _slope_of_projection(points, focal[to] * factor)
+    by_depth = jnp.einsum("mpij,mj->mpi", slope, shift) * inverse[None, :, None]
+    loss = (1 + jnp.sum(error * error, axis=-1) / sigma**2) ** -2
+    w = jnp.where(points[..., 2] > _IN_FRONT, problem.weight[s] * loss / how.sigma**2, 0)
+    return _Seen(rays, turn, points, position, error, slope, by_depth, w)
+
+
+def _equations(problem: _Problem, state: _State, sigma: Array, s: Array) -> _Equations:
+    """Return the equations of frame `s`, without its depths."""
+    how = problem.how
+    rays, turn, points, position, error, slope, by_depth, w = _seen(problem, state, sigma, s)
+    inverse = jnp.exp(state.log_inverse[s])
+    by_other = slope @ _slope_of_motion(points, inverse)
+    by_own = -slope @ jnp.einsum("mij,pjk->mpik", turn, _slope_of_motion(rays, inverse))
+    depth_curvature = jnp.einsum("mp,mpi->p", w, by_depth**2) + how.depth_prior**-2
+    depth_slope = jnp.einsum("mp,mpi,mpi->p", w, by_depth, error)
+    depth_slope += (state.log_inverse[s] - problem.mean[s]) * how.depth_prior**-2
+    own, other = w[..., None, None] * by_own, w[..., None, None] * by_other
+    corner, between = jnp.einsum("mpia,mpib->ab", own, by_own), jnp.einsum("mpia,mpib->mab", own, by_other)
+    blocks = _local_blocks(corner, between, jnp.einsum("mpia,mpib->mab", other, by_other))
+    gradient = _by_cameras(own, other, error)
+    cross_own = jnp.einsum("mpia,mpi->pa", own, by_depth)[:, None]
+    cross = jnp.concatenate([cross_own, jnp.einsum("mpia,mpi->pma", other, by_depth)], axis=1)
+    blocks -= jnp.einsum("pma,pnb->mnab", cross / depth_curvature[:, None, None], cross)
+    gradient -= jnp.einsum("pma,p->ma", cross, depth_slope / depth_curvature)
+    if how.focal_prior is None:
+        none = jnp.zeros((), gradient.dtype)
+        of_focal = (jnp.zeros(len(inverse), gradient.dtype), jnp.zeros_like(gradient), none, none)
+    else:  # a longer focal length turns the ray inwards, and moves the position outwards
+        inwards = jnp.einsum("mpij,mjk,pk->mpi", slope, turn, rays * np.array([[-1.0, -1, 0]], np.float32))
+        by_focal = inwards + position - problem.centre[jnp.asarray(problem.others)[s]]
+        weighted = w[..., None] * by_focal
+        focal_cross = jnp.einsum("mpi,mpi->p", weighted, by_depth)
+        of_focal = (
+            focal_cross,
+            _by_cameras(own, other, by_focal) - jnp.einsum("pma,p->ma", cross, focal_cross / depth_curvature),
+            jnp.sum(weighted * by_focal) - jnp.sum(focal_cross**2 / depth_curvature),
+            jnp.sum(weighted * error) - jnp.sum(focal_cross * depth_slope / depth_curvature),
+        )
+    return _Equations(blocks, gradient, cross, depth_curvature, depth_slope, *of_focal)
+
+
+def _by_cameras(
+    own: Float[Array, "M P 2 6"], other: Float[Array, "M P 2 6"], values: Float[Array, "M P 2"]
+) -> Float[Array, "N 6"]:
+    """Return the sums of values in the picture by the motion of the own camera, first, and of the M others."""
+    return jnp.concatenate([jnp.einsum("mpia,mpi->a", own, values)[None], jnp.einsum("mpia,mpi->ma", other, values)])
+
+
+def _step(problem: _Problem, state: _State, sigma: Array) -> _State:
+    """Return the state after one step of Gauss and Newton."""
+    of = _of_frames(lambda s: _equations(problem, state, sigma, s), problem)
+    change, by_focal = _change(of, problem, state)
+    by_cameras = jnp.einsum("spma,sma->sp", of.cross, change[problem.seen_by])
+    deeper = -(of.depth_slope + by_cameras + of.focal_cross * by_focal) / of.depth_curvature
+    turned = quaternion_to_matrix(jnp.concatenate([change[:, :3] / 2, jnp.ones_like(change[:, :1])], axis=-1))
+    translation = jnp.einsum("sij,sj->si", turned, state.translation) + change[:, 3:]
+    log_inverse = state.log_inverse + jnp.clip(deeper, -_LARGEST_STEP, _LARGEST_STEP)
+    log_focal = state.log_focal + by_focal
+    return _State(turned @ state.rotation, translation, log_inverse, log_focal, state.moved + change)
+
+
+def _outcome(problem: _Problem, state: _State, sigma: Array, s: Array) -> tuple[Array, Array, Array, Array]:
+    """Return position, depth in the other frames, information and pull of the patches of frame `s`."""
+    world = _seen(problem, state, sigma, s)
+    information = jnp.einsum("mp,mpi->p", world.weight, world.by_depth**2)
+    pull = jnp.einsum("mp,mpi,mpi->p", world.weight, world.by_depth, world.error)
+    return world.position, world.points[..., 2], information, pull / jnp.maximum(information, _LEAST_INFORMATION)
 
 
 def at_patches(depth: Float[Array, "B S H W"], grid: tuple[int, int]) -> Float[Array, "B S P"]:
@@ -216,22 +243,22 @@ def at_patches(depth: Float[Array, "B S H W"], grid: tuple[int, int]) -> Float[A
     return depth.reshape(B, S, h, side, w, side)[:, :, :, middle, :, middle].mean(axis=(3, 5)).reshape(B, S, h * w)
 
 
-def _of_frames(function: Callable[[Array], _Result], S: int, matches: int) -> _Result:
+def _of_frames(function: Callable[[Array], _Result], problem: _Problem) -> _Result:
     """Return the function of every frame's index, of all at once where their matches are few."""
-    at_once = max(1, _AT_ONCE // matches)
+    S, M, P = problem.weight.shape
+    at_once = max(1, _AT_ONCE // (M * P))
     return (
         jax.vmap(function)(jnp.arange(S)) if at_once >= S else jax.lax.map(function, jnp.arange(S), batch_size=at_once)
     )
 
 
-def _change(
-    of: _Equations, seen_by: np.ndarray, prior: Array, state: _State, how: Adjustment
-) -> tuple[Float[Array, "S 6"], Array]:
+def _change(of: _Equations, problem: _Problem, state: _State) -> tuple[Float[Array, "S 6"], Array]:
     """Return the step of every camera, 0 for the first, and of the log focal length, by the damped normal equations.
 
     Each array of `of` has a leading axis of the S frames.
     """
-    S = len(of.gradient)
+    S, how, seen_by = len(of.gradient), problem.how, problem.seen_by
+    prior = jnp.repeat(jnp.array([how.rotation_prior, how.translation_prior], of.gradient.dtype) ** -2.0, 3)
     is_free = np.arange(6 * S) >= 6
     H = jnp.zeros((S, S, 6, 6), of.blocks.dtype).at[seen_by[:, :, None], seen_by[:, None, :]].add(of.blocks)
     H = H.swapaxes(1, 2).reshape(6 * S, 6 * S) + jnp.diag(jnp.tile(prior, S))
