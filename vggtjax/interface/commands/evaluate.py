@@ -83,6 +83,17 @@ class Folders:
     format: InWords[ReadFormat | None] = None
     quaternion: InWords[Literal["xyzw", "wxyz"] | None] = None
 
+    def check(self, candidates: Candidates) -> None:
+        """Raise InputError for folders beside a model, and for words about folders without any."""
+        if self.results:
+            for name, value in vars(candidates).items():
+                if value is not None:
+                    raise InputError(f"--{name} and --results exclude each other; give one of them")
+            return
+        for name in ("format", "quaternion"):
+            if getattr(self, name) is not None:
+                raise InputError(f"--{name} is about the folders of --results; give both or neither")
+
     def source(self, *, strict: bool = False) -> FolderSource:
         """Return the results in the folders."""
         from vggtjax.research.evaluation.sources import FolderSource
@@ -135,6 +146,14 @@ class ScoreOptions:
     pairs: Literal["vggt", "pi3", "da3", "matching"] = "vggt"
     empty: Literal["davis", "vggt4d"] = "davis"
     strict: Annotated[bool, tyro.conf.arg()] = False
+
+    @property
+    def drawn_frames(self) -> str:
+        """Which frames a list or a seed chooses, in words; empty without them."""
+        if self.frames_list is None and self.frames_seed is None:
+            return ""
+        drawn = f"ten at random, by the seed {self.frames_seed or 0}"
+        return f"frames: {drawn if self.frames_list is None else f'those of {self.frames_list}, or {drawn}'}"
 
 
 def evaluate(
@@ -192,23 +211,14 @@ def evaluate(
         named = ", ".join(one_line(name, 60) for name in list(found)[:_SHOWN])
         more = f" and {len(found) - _SHOWN} more" if len(found) > _SHOWN else ""
         report.note(f"{len(found)} sequence{'' if len(found) == 1 else 's'}: {named}{more}")
-        frames = chosen_frames(dataset, sampling)
-        taken = _frames_in_words(frames, dataset if DATASETS[dataset].has_protocol else None, sampling)
-        if scores.frames_list is not None or scores.frames_seed is not None:
-            drawn = f"ten at random, by the seed {scores.frames_seed or 0}"
-            taken = f"frames: {drawn if scores.frames_list is None else f'those of {scores.frames_list}, or {drawn}'}"
+        frames, labels = chosen_frames(dataset, sampling), DATASETS[dataset]
+        taken = scores.drawn_frames or _frames_in_words(frames, dataset if labels.has_protocol else None, sampling)
         report.note(taken)
+        folders.check(candidates)
         if folders.results:
-            for name, value in vars(candidates).items():
-                if value is not None:
-                    raise InputError(f"--{name} and --results exclude each other; give one of them")
             source = folders.source(strict=scores.strict)
         else:
-            for name in ("format", "quaternion"):
-                if getattr(folders, name) is not None:
-                    raise InputError(f"--{name} is about the folders of --results; give both or neither")
             source = candidates.source(report, options, framing)
-        labels = DATASETS[dataset]
         settings = {
             "version": __version__,
             "dataset": dataset,

@@ -21,7 +21,7 @@ from vggtjax.clips.captures.frames import CaptureFrames
 from vggtjax.clips.clip import Clip
 from vggtjax.clips.fingerprint import source_setting
 from vggtjax.clips.masks import load_masks, masks_digest
-from vggtjax.clips.media.sampling import Sampling
+from vggtjax.clips.media.sampling import Sampling, Source
 from vggtjax.clips.preprocessing import Fitter, Framing
 from vggtjax.clips.queries import Queries, check_queries, check_words, parse_queries
 from vggtjax.clips.sources import ClipSource, open_source
@@ -224,26 +224,11 @@ def run_windows(
     assert windows.window is not None
     cut = plan_windows(frames, windows.window, windows.shared)
     known = source_setting(opened)
-    decides = (
-        settings
-        | known
-        | {
-            "sampling": dataclasses.asdict(plan.sampling),
-            "fitter": dataclasses.asdict(plan.fitter),
-            "windows": [frames, windows.window, windows.shared],
-        }
-    )
-    if isinstance(opened, CaptureFrames) and opened.lenses_undone:
-        decides["undistorted"] = opened.lenses_undone
+    decides = settings | known | _choices(opened, plan, frames, windows)
     clips = window_clips(opened, plan.sampling, plan.fitter, cut)
     first = next(clips)  # what is wrong with it is found before anything is written
+    _check_first(first, frames, plan, tools)
     shape = (frames, *first.images.shape[1:3])
-    if plan.tracks is not None:
-        tools.check_track_size(*shape[1:])
-        if isinstance(plan.tracks, str):
-            check_queries(plan.tracks, first, frames)
-        else:
-            plan.tracks.check(*shape)
     sizes = np.repeat(first.source_size[:1], frames, axis=0)
     announce(out, forecast_bytes(shape, sizes, plan.saving) + _JOINED * np.prod(shape))
     with locked_folder(out / FOLDER, "the windows of a clip"):
@@ -284,3 +269,26 @@ def run_windows(
         del result
         store.remove()
     return Reconstruction.load(out)
+
+
+def _choices(opened: Source, plan: LongRun, frames: int, windows: Windows) -> dict[str, Any]:
+    """Return what decides the frames of the windows, as JSON values."""
+    undone = isinstance(opened, CaptureFrames) and opened.lenses_undone
+    return {
+        "sampling": dataclasses.asdict(plan.sampling),
+        "fitter": dataclasses.asdict(plan.fitter),
+        "windows": [frames, windows.window, windows.shared],
+        **({"undistorted": undone} if undone else {}),
+    }
+
+
+def _check_first(first: Clip, frames: int, plan: LongRun, tools: Tools) -> None:
+    """Raise InputError where the points to follow do not fit the clip, of which this is the first window."""
+    if plan.tracks is None:
+        return
+    height, width = first.images.shape[1:3]
+    tools.check_track_size(height, width)
+    if isinstance(plan.tracks, str):
+        check_queries(plan.tracks, first, frames)
+    else:
+        plan.tracks.check(frames, height, width)

@@ -123,12 +123,7 @@ def ladder(
             prediction that cannot be scored is not an error: its row has the reason.
     """
     truth = batched_truth(truth)
-    if foreign := [method for method in methods if find_method(method) and method not in ABLATION]:
-        raise InputError(f"methods has {foreign}, which mine their masks in another way; expected some of {ABLATION}")
-    if unknown := [source for source in masks if source not in get_args(MaskSource)]:
-        raise InputError(f"masks has {unknown}; expected 'mined', 'matches' or 'true'")
-    if batch_size < 1:
-        raise InputError(f"batch_size is {batch_size}; expected at least 1")
+    _check_choices(methods, masks, batch_size)
     masked = tuple(name for name in methods if find_method(name).needs_second_pass)
     plain = tuple(name for name in methods if name not in masked)
     pairs = (model.config.motion.mask_pairs,) if mask_pairs is None else mask_pairs
@@ -171,6 +166,15 @@ def ladder(
         advance()
         rows += chain.from_iterable(by_setting[setting] for setting in settings)
     return sorted(rows, key=lambda row: row.clip)
+
+
+def _check_choices(methods: Sequence[str], masks: Sequence[MaskSource], batch_size: int) -> None:
+    if foreign := [method for method in methods if find_method(method) and method not in ABLATION]:
+        raise InputError(f"methods has {foreign}, which mine their masks in another way; expected some of {ABLATION}")
+    if unknown := [source for source in masks if source not in get_args(MaskSource)]:
+        raise InputError(f"masks has {unknown}; expected 'mined', 'matches' or 'true'")
+    if batch_size < 1:
+        raise InputError(f"batch_size is {batch_size}; expected at least 1")
 
 
 def score_result(result: Reconstruction, truth: ClipTruth, mask_source: Literal["mined", "pixels"]) -> LadderRow:
