@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 from collections.abc import Callable, Sequence
 from pkgutil import resolve_name
@@ -42,6 +43,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except VggtjaxError as error:
         sys.stderr.write(f"benchmarks: {error}\n")
         return 2
+    finally:
+        logging.disable(logging.NOTSET)  # some commands disable warnings
     return 0
 
 

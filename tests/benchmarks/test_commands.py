@@ -39,7 +39,6 @@ def run(monkeypatch, capsys):
 
     yield command
     logging.getLogger("vggtjax").setLevel(level)
-    logging.disable(logging.NOTSET)
 
 
 def cells(text: str) -> dict[str, list[str]]:
