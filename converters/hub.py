@@ -16,7 +16,7 @@ _DIGEST = re.compile("[0-9a-f]{40}|[0-9a-f]{64}")
 def download(hub_id: str, file: str | None = None, revision: str | None = None) -> tuple[Path, str]:
     """Return a file of weights (for shards, their index) in the hub's cache, and its commit; download it unless cached.
 
-    Without `revision`, a commit of 40 hexadecimal letters, the default branch is resolved to its commit once; later
+    Without `revision`, a commit of 40 hexadecimal digits, the default branch is resolved to its commit once; later
     calls take the same commit. Every file is verified against the digest that the hub declared then, which the record
     of the repository keeps (`hub_record`): sha256, and git's id of the index of shards. A cached file needs no network.
     Without `file`, `choose_file` chooses the file.
@@ -91,7 +91,7 @@ def _declared(hub_id: str, revision: str | None) -> tuple[str, dict[str, HubFile
     info = HfApi().model_info(hub_id, revision=revision, files_metadata=True)
     commit = info.sha or ""
     if not COMMIT.fullmatch(commit) or commit != (revision or commit):
-        expected = revision or "a commit of 40 hexadecimal letters"
+        expected = revision or "a commit of 40 hexadecimal digits"
         raise CheckpointError(f"the hub answers for '{hub_id}' with {commit[:40]!r}; expected {expected}: try again")
     weights = [file for file in info.siblings or [] if file.rfilename.endswith(SUFFIXES) and "/" not in file.rfilename]
     digests = {file.rfilename: (file.lfs.sha256 if file.lfs else file.blob_id) or "" for file in weights}

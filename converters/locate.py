@@ -47,7 +47,7 @@ def locate(source: str | Path) -> Weights:
         if (not hub_id.endswith(SUFFIXES)) if file is None else file.endswith(SUFFIXES):
             if revision is not None and not COMMIT.fullmatch(revision):
                 raise CheckpointError(
-                    f"the revision {revision!r} of '{hub_id}' is not a commit; expected its 40 hexadecimal letters, "
+                    f"the revision {revision!r} of '{hub_id}' is not a commit; expected its 40 hexadecimal digits, "
                     "which its page on the hub shows under History"
                 )
             name = source.partition("@")[0]

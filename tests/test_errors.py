@@ -24,7 +24,9 @@ def test_the_middle_of_a_long_message_is_left_out():
     assert shown.startswith("xxx")
     assert shown.endswith("x is bad; rename it")
     assert str(InputError("two\nlines \x1b[31m\udcff")) == "two lines ?[31m?"
-    assert str(errors.MissingExtraError("depth", "exr")) == "depth needs the extra 'exr': pip install -e '.[exr]'"
+    assert str(errors.MissingExtraError("depth", "exr")) == (
+        "depth needs the extra 'exr'; in the folder of the vggtjax clone: pip install -e '.[exr]'"
+    )
 
 
 def test_problems_fill_a_message_and_no_more():

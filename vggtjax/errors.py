@@ -57,7 +57,8 @@ class MissingExtraError(VggtjaxError, ImportError):
     """A missing optional dependency; the message names the extra that installs it."""
 
     def __init__(self, purpose: str, extra: str) -> None:
-        super().__init__(f"{purpose} needs the extra '{extra}': pip install -e '.[{extra}]'")
+        remedy = f"in the folder of the vggtjax clone: pip install -e '.[{extra}]'"
+        super().__init__(f"{purpose} needs the extra '{extra}'; {remedy}")
 
 
 def check_extra(purpose: str, extra: str, *modules: str) -> None:

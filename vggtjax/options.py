@@ -137,9 +137,9 @@ class Options:
             --refine-cameras its points are fitted too
         compute_dtype: number type of the transformer's matrix products; by default bfloat16 on a GPU or TPU, and on a
             CPU float32, or bfloat16 if reconstruct runs a large model and a short trial finds it faster there
-        precision: how exactly a GPU or TPU computes: tf32, the default there, fast, with about three decimal digits in
-            the products that make depth and motion cues, as PyTorch has it in convolutions; highest, slower, with the
-            seven digits of float32 there and, without --dtype, in the transformer. A CPU always has seven
+        precision: of the depth heads and motion cues on a GPU or TPU: tf32, the default, fast, about three decimal
+            digits; highest, float32, about seven digits, and then --dtype is float32 by default too. A CPU always
+            computes them in float32
         attention: how frames attend to each other: exact; sampled, an approximation that sees a third of the tokens of
             other frames: faster for long clips, with other numbers (its errors are in the docs)
         reference: the frame that Depth Anything 3 looks at first: chosen, the most ordinary one; first or middle, by

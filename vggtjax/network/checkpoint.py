@@ -308,7 +308,7 @@ def _read_metadata(path: Path, metadata: Mapping[str, str]) -> tuple[VGGTConfig,
     revision = metadata.get("revision", "")
     if revision and not _COMMIT.fullmatch(revision):
         raise CheckpointError(
-            f"the revision of {path} is {revision[:50]!r}; expected a commit of 40 hexadecimal letters"
+            f"the revision of {path} is {revision[:50]!r}; expected a commit of 40 hexadecimal digits"
         )
     name = metadata.get("name", "")
     is_valid = name.isprintable() and 0 < len(name) <= _MOST_NAME_LETTERS

@@ -128,7 +128,7 @@ def available(params: Any = None) -> Room | None:
         return None
     free = stats["bytes_limit"] - stats.get("bytes_in_use", 0)
     held = sum(leaf.nbytes for leaf in jax.tree.leaves(params) if isinstance(leaf, jax.Array))
-    return Room(free + held, "of the device")
+    return Room(free + held, "on the device")
 
 
 def room_of_gpu(name: str) -> Room:

@@ -50,7 +50,7 @@ def check_no_part(files: Iterable[Path], result: Path, *, what: str, foreign: bo
     Args:
         files: those to check; a missing one is no part, nor is one that a command added to a result that was there.
         result: the folder of a result, or a file in it.
-        what: what would happen to the file, such as "no film replaces it".
+        what: what would happen to the file, and what to do, such as "no film replaces it; choose another name".
         foreign: the result is another program's; every file in its folder is a part.
     """
     folder = (result if result.is_dir() else result.parent).resolve()
@@ -61,7 +61,7 @@ def check_no_part(files: Iterable[Path], result: Path, *, what: str, foreign: bo
             continue
         name = place.relative_to(folder)
         if name.as_posix() not in ADDED and (foreign or name.parts[0] in names):
-            raise OutputError(f"{file} is part of the result in {folder}, and {what}; choose another name")
+            raise OutputError(f"{file} is part of the result in {folder}, and {what}")
 
 
 @contextmanager

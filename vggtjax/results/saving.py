@@ -46,7 +46,8 @@ class Saving:
     """How a result is written. Raises InputError for a percentile outside [0, 100) or an unknown name.
 
     Attributes:
-        confidence_percentile: percent of the pixels, the least confident ones, to leave out of the point clouds
+        confidence_percentile: leave out this percentage of the pixels, those of the lowest confidence, from the point
+            clouds; at least 0 and less than 100
         resolution: size of the written files: model, or original, the source's own, with crop, scale and padding undone
         format: the program whose files the folder has: vggtjax; or vggt4d, with its files in vggt4d/ beside ours
         only: write only these groups of files: depth, confidence, cameras, masks, previews, clouds, scene, report; all

@@ -8,8 +8,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
-from vggtjax.storage.kept_text import kept_text
-
 
 def file_digest(paths: Iterable[Path]) -> str:
     """Return a digest of the names, sizes and dates of files; raises OSError for one that is missing."""
@@ -41,6 +39,8 @@ def file_facts(path: Path) -> FileFacts | None:
 @lru_cache(maxsize=64)
 def content_digest(facts: FileFacts) -> str:
     """Return the sha256 of a file, computed once and kept: hashing 5 GB takes seconds."""
+
+    from vggtjax.storage.kept_text import kept_text  # which imports jax
 
     def digest() -> str:
         with facts.path.open("rb") as file:

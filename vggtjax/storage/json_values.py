@@ -98,6 +98,7 @@ def check_fields(instance: Any, what: str = "", *, error: type[InputError] = Inp
             value = _converted(getattr(instance, name), hint)
         except _MisfitError as misfit:
             place, words = misfit.args
+            words = words.removesuffix(" or null")  # which a command line cannot say
             raise error(f"{what}{'.' if what else ''}{name}{place} {words}") from None
         object.__setattr__(instance, name, value)
 

@@ -59,8 +59,8 @@ def _left(root: Path) -> list[Room]:
     available = proc_bytes(root / "proc/meminfo", "MemAvailable")
     if available is None:
         return []
-    left = [Room(available, "of the computer")]
-    left += [Room(size, "of its container (cgroup)", True) for size in _group_rooms(root)]
+    left = [Room(available, "in the computer")]
+    left += [Room(size, "in its container (cgroup)", True) for size in _group_rooms(root)]
     left += [Room(max(0, limit - used - _LATER), f"within {name}", True) for name, limit, used in own_limits(root)]
     return left
 

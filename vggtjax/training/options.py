@@ -18,7 +18,8 @@ class RunOptions:
         checkpoint_seconds: time between checkpoints.
         seconds: time limit, after which the run ends with a checkpoint; the same command resumes it. None is set
             by default.
-        clips: folder for rendered clips of worlds, which runs of equal rows share; by default clips/ in the run's own.
+        clips: folder for rendered clips of worlds; runs can share it, and clips of equal settings, assets, sizes and
+            data_seed are rendered once. By default clips/ in --out.
         renderers: processes that render clips of worlds.
         dtype: of the weights in model.safetensors.
     """

@@ -54,7 +54,7 @@ class _Gpu:
 
 
 def use_gpu(monkeypatch, *memory_of_gpu):
-    monkeypatch.setattr(memory, "on_cpu", lambda: False)
+    monkeypatch.setattr(memory, "has_accelerator", lambda: True)
     monkeypatch.setattr(jax, "local_devices", lambda: [_Gpu(*memory_of_gpu)])
 
 

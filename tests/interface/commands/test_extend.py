@@ -69,7 +69,7 @@ def test_what_does_not_fit_is_refused_and_nothing_is_written(result, pictures, t
     out = tmp_path / "out"
     for arguments, sentence in (
         ((same, "--out", out), "'000000' and 4 more of the new clip has the name of a frame of the result"),
-        ((noise, "--out", out), "show another place"),
+        ((noise, "--out", out), "no known frame shows the place"),
         ((wide, "--out", out), "expected frames of the same shape"),
         ((noise, "--out", result), "the folder of the result, which stays as it is"),
         ((noise, "--out", out, "--anchors", 2), "--anchors is 2"),

@@ -30,7 +30,7 @@ def test_the_smoke_recipe_runs_in_seconds(tmp_path, capsys):
     command.train(SMOKE, tmp_path, options=RunOptions(log_every=5))
     captured = capsys.readouterr()
     assert "10 of 10" in captured.out
-    assert "the first step compiles" in captured.err
+    assert "the first step with each phase" in captured.err
     rows = read_metrics(tmp_path / "metrics.csv")
     assert len(rows) == 2
     assert np.isfinite([row["loss"] for row in rows]).all()

@@ -147,7 +147,7 @@ def test_a_clip_that_ends_a_worker_twice_fails_and_the_others_do_not(monkeypatch
 
     made, ray, notes = outcomes(monkeypatch, tmp_path / "out", {"b": RayActorError()})
     assert {name for name, outcome in made.items() if outcome.status == "done"} == set("acd")
-    assert "two workers ended with it in their work" in made["b"].reason
+    assert "the worker process died twice on this clip" in made["b"].reason
     assert list(ray.calls.values()) == ["ready", "ready", "a", "b", "c", "d"]  # two workers, a clip each
     assert ray.at_once == [2, 2, 2, 2, 2, 1]  # one ends as no clip waits for it
     assert ray.options_given == {"num_cpus": 1, "num_gpus": 0.0, "max_restarts": -1, "max_task_retries": 1}
@@ -184,9 +184,9 @@ def test_workers_of_other_code_and_other_files_and_those_that_cannot_begin(monke
     with pytest.raises(ClusterError, match="two workers have different size"):
         outcomes(monkeypatch, tmp_path / "b", {"ready": [READY, smaller]})
     problem = RayTaskError("ready", "Traceback ...", InputError("no such model"), proctitle="a worker", ip="here")
-    with pytest.raises(ClusterError, match="a worker cannot begin: no such model"):
+    with pytest.raises(ClusterError, match="a worker cannot start: no such model"):
         outcomes(monkeypatch, tmp_path / "c", {"ready": problem.as_instanceof_cause()})
-    with pytest.raises(ClusterError, match="a worker cannot begin: "):
+    with pytest.raises(ClusterError, match="a worker cannot start: "):
         outcomes(monkeypatch, tmp_path / "d", {"ready": RayActorError()})
 
 

@@ -42,9 +42,10 @@ class Sampling:
 
     Attributes:
         start: first frame to take, counted from 0 in frames of the source
-        stride: take every n-th frame; every frame by default, in an evaluation those of the published protocol
-        fps: take so many frames per second of a video, by presentation time; not together with stride
-        max_frames: take at most so many frames; all by default
+        stride: take every n-th frame; every frame by default
+        fps: take this many frames per second, by the times of the frames; for a video, an animation, or pictures with
+            known times; excludes stride
+        max_frames: take at most this many frames; all by default
         skip: frames to leave out, such as 0-2,17, counted as for start; none by default
     """
 
@@ -139,7 +140,7 @@ class Sampling:
 
 def before_it(frame: int) -> str:
     """Return what to do with a source that breaks off at a frame, counted in frames of the source."""
-    return f"write it anew, or take frames before {frame} alone (start, stride, max_frames)"
+    return f"write it anew, or take only frames before {frame} (start, stride, max_frames)"
 
 
 class Source(Protocol):

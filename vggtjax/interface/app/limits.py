@@ -17,10 +17,10 @@ class Limits:
     """The bounds of a job and of the queue. Raises InputError for a number below 1.
 
     Attributes:
-        max_upload_mb: megabytes of the video, or of all pictures together
-        max_seconds: length of a video
-        max_frames: frames that are reconstructed of a video or of pictures
-        max_waiting: jobs that wait for their turn; one runs at a time
+        max_upload_mb: most megabytes of a video, or of all pictures together
+        max_seconds: longest video that is accepted, in seconds
+        max_frames: most frames that are reconstructed of a video or of pictures
+        max_waiting: most jobs that wait; one runs at a time
     """
 
     max_upload_mb: _Count = 500

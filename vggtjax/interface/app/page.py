@@ -102,7 +102,9 @@ def build_page(jobs: Jobs) -> gr.Blocks:
                     with gr.Tab("Viewer"):
                         viewer = gr.HTML(elem_id="viewer")
                     with gr.Tab("Film"):
-                        film = gr.Video(label="The camera circles the scene", autoplay=True, loop=True, elem_id="film")
+                        film = gr.Video(
+                            label="The camera swings around the scene", autoplay=True, loop=True, elem_id="film"
+                        )
                     with gr.Tab("Layers"):
                         layers = gr.Video(
                             label="Picture, depth, confidence, motion", autoplay=True, loop=True, elem_id="layers"

@@ -72,7 +72,7 @@ def batch(
         outcomes: list[ClipOutcome] = []
 
         def stopped() -> str:
-            return f"{len(outcomes)} of {len(part)} clips are done; the same command goes on with the others"
+            return f"{len(outcomes)} of {len(part)} clips are finished or failed; run the same command again to resume"
 
         with kept(stopped), report.stage("clips") as show:
             clock = _Clock(show)

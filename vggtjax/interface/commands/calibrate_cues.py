@@ -39,7 +39,7 @@ def calibrate_cues(
     max_terms: int = 5,
     floor: float = 0.0,
     mask_pairs: _Pairs = None,
-    assets: Path | None = None,
+    assets: InWords[Path | None] = None,
     seed: int = 0,
 ) -> None:
     """Choose a model's motion cues and the pairs of blocks that match frames, and save the model with them.
@@ -55,12 +55,13 @@ def calibrate_cues(
         size: side of the images in pixels; the model's own by default.
         gram: similarity of the cues; with dot, --mask-pairs tries dropped keys instead of zeroed ones.
         max_terms: largest number of cues.
-        floor: added to every map before the product, from 0 (as in the papers) to 1; the model's own does not count.
+        floor: added to every map before the product, from 0 (as in the papers) to 1; the floor that the model
+            stores is not used.
         mask_pairs: numbers of pairs to try on all of the scenes, with masks mined by both thresholds (otsu,
             multi-otsu). The number and the threshold with the lowest camera errors become what the model recommends;
             without this option the model keeps its own.
         assets: folder of textures, photographs and objects: clips are of rooms, streets and landscapes of these, 16:9,
-            instead of rooms of simple shapes.
+            instead of rooms of simple shapes; none by default.
         seed: another seed draws other scenes.
     """
     if scenes < 2:
@@ -141,11 +142,15 @@ def _print(report: Report, choice: Choice, came_back: np.ndarray, second: Second
 def _matching_line(pairs: tuple[int, ...] | None, shares: np.ndarray) -> str:
     """Return which pairs of blocks match frames, and how many of the others' matches come back."""
     if pairs is None:
-        most = f"{shares.max():.0%} of its matches come back"
-        return f"No pair of blocks matches frames (at most {most}): the model names none, and those by rule are taken."
-    found = ", ".join(f"{pair} ({shares[pair]:.0%} of the matches come back)" for pair in pairs)
+        most = f"{shares.max():.0%} of the matches of a pair are cycle-consistent"
+        return (
+            f"No pair of blocks matches frames (at most {most}); the model stores none, and the pairs at 0.5 to 0.65 "
+            "of its depth are used."
+        )
+    found = ", ".join(f"{pair} ({shares[pair]:.0%} of the matches are cycle-consistent)" for pair in pairs)
     others = [share for pair, share in enumerate(shares) if pair not in pairs]
-    return f"Pairs of blocks that match frames: {found}" + (f"; others at most {max(others):.0%}." if others else ".")
+    rest = f"; in the others at most {max(others):.0%}" if others else ""
+    return f"Pairs of blocks that match frames: {found}{rest}."
 
 
 def _clips(

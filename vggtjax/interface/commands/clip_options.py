@@ -19,10 +19,12 @@ class GivenInputs:
     """Masks and points of the user. Raises InputError for options that exclude each other.
 
     Attributes:
-        masks: folder of pictures, one per frame, bright where something moves; mined from the clip by default
-        no_masks: nothing moves: one pass is enough
-        tracks: points to follow: grid:20 for 20 x 20 over the first frame, or a CSV file with columns x, y and, if
-            wanted, frame, in pixels of the source; none by default
+        masks: folder of mask pictures, one per frame and named like it (or with other names throughout, in the same
+            order), white where something moves; by default masks are mined from the clip
+        no_masks: treat the scene as static: no mask is mined and no second pass is run
+        tracks: points to follow: grid:20 for 20 x 20 over the first frame, or a CSV file with columns x, y and
+            optionally frame (counted from 0 among the frames that are taken; 0 by default), in pixels of the source;
+            none by default
     """
 
     masks: InWords[Path | None] = None

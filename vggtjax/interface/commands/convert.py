@@ -25,14 +25,15 @@ def convert(
     dtype: Literal["float32", "bfloat16"] = "float32",
     overwrite: Overwrite = False,
 ) -> None:
-    """Convert a PyTorch VGGT checkpoint to one .safetensors with Flax names, and say what was read and written.
+    """Convert PyTorch weights of VGGT or Depth Anything 3 to one .safetensors, and say what was read and written.
 
     Args:
         source: a .safetensors file, a sharded one (its index or folder), a .pt or .pth file, or a hub id.
         destination: the .safetensors file to write.
-        revision: commit of a hub id, 40 hexadecimal letters; by default the newest one of the first use.
+        revision: commit of a hub id, 40 hexadecimal digits; by default the one that was newest at the first use.
         config: JSON file with the configuration; that of the published model by default.
-        heads: heads to convert, such as camera,depth; all of camera,depth,points,tracks by default.
+        heads: heads to convert, such as camera,depth; by default all heads of the model: camera,depth,points,tracks of
+            VGGT, camera,depth,rays of Depth Anything 3.
         dtype: of the written weights.
         overwrite: replace the file if it exists.
     """

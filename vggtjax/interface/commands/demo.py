@@ -14,9 +14,10 @@ from vggtjax.options import MethodName, Options
 
 
 def demo(*, out: Path = Path("demo-output"), method: MethodName = "4dvggt-m", view: Switch = False) -> None:
-    """Reconstruct the embedded clip with the embedded model, and measure the ladder of methods against its truth.
+    """Reconstruct the clip of the package with the model of the package, and compare four methods with its truth.
 
-    The result's depth and cameras are consistent; the viewer has them as they were predicted, too.
+    The methods are vggt, pose-decoupling, hard-replacement and 4dvggt-d. Depth and cameras of the result are fitted to
+    the pixels (--consistent-depth of reconstruct); the viewer also shows them as predicted.
 
     Args:
         out: folder for the results.

@@ -195,7 +195,8 @@ def _print(report: Report, found: dict[str, Any]) -> None:
         report.line("")
     missing = [extra["name"] for extra in found["extras"] if extra["missing"] and extra["name"] != _HARDWARE]
     if missing:
-        report.line(f"Missing extras are installed by: pip install -e '.[{','.join(missing)}]'")
+        command = f"pip install -e '.[{','.join(missing)}]'"
+        report.line(f"Missing extras are installed, in the folder of the vggtjax clone, by: {command}")
 
 
 def _memory(memory: dict[str, Any]) -> dict[str, str]:

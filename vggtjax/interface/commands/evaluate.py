@@ -30,7 +30,12 @@ _SHOWN = 8  # names of sequences in the first lines
 
 @dataclass(frozen=True)
 class EvaluatedOptions(Options):
-    """The options of all methods; `--methods` names the methods."""
+    """The options of all methods; `--methods` names the methods.
+
+    Attributes:
+        consistent_depth: fit depth, cameras and focal length to the pixels of the source, and join what several frames
+            see, where nothing moves (not in the papers; off by default here, on in the commands reconstruct and batch)
+    """
 
     method: tyro.conf.Suppress[MethodName] = "4dvggt-d"
     refine_cameras: tyro.conf.Suppress[bool] = False
@@ -38,7 +43,15 @@ class EvaluatedOptions(Options):
 
 @dataclass(frozen=True)
 class EvaluatedFrames(Sampling):
-    """Frames of a data set, which has pictures without presentation times."""
+    """Frames of a data set, which has pictures without presentation times.
+
+    Attributes:
+        start: first frame to take, counted from 0 from the first frame of the data set's published protocol
+        stride: take every n-th frame; by default as in the published protocol
+        max_frames: take at most this many frames, and never more than the published protocol; by default as many as the
+            protocol
+        skip: frames to leave out, such as 0-2,17, counted as for start; none by default
+    """
 
     fps: tyro.conf.Suppress[float | None] = None
 
@@ -76,7 +89,8 @@ class Folders:
         results: score results in these folders instead, each with a folder per sequence; no model is run. FORMAT is the
             program that wrote a folder, as of --format
         format: the program whose files the folders of --results have that name none; vggtjax by default
-        quaternion: order of quaternions in their pred_traj.txt: wxyz as MonST3R and VGGT4D write it, or xyzw
+        quaternion: order of the quaternions in pred_traj.txt, required for vggt4d, monst3r, easi3r, das3r and pomato:
+            wxyz as these programs write it, or xyzw; not for other formats
     """
 
     results: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=[FORMAT:]FOLDER ...", help_behavior_hint="")] = ()
@@ -123,17 +137,17 @@ class ScoreOptions:
 
     Attributes:
         sequences: names, with commas; the sequences of the published protocol, or all, by default
-        frames_list: file with the frames of each sequence, numbers or names, in JSON or text as published; they are
-            taken in place of the protocol's, and its sequences alone
-        frames_seed: take ten random frames of each sequence, drawn by this seed; of those that a list names without
-            frames in any case
+        frames_list: file with the frames of each sequence, numbers or names, in JSON or text as published; only the
+            sequences in the file are scored, and their frames replace those of the protocol
+        frames_seed: score ten random frames of each sequence, drawn with this seed; with --frames-list only in
+            sequences that the file lists without frames, for which the seed is 0 by default
         gt: ground truth to use, where a data set has several: for dycheck easi3r (the default) or lidar
-        depth_align: how video depth is brought to metres: by ten rounds towards the scale of the least absolute error,
-            as MonST3R and CUT3R do it (scale); by that scale itself (least-absolute); by a scale and a shift; by
-            medians; or not
-        pairs: whose AUC of the relative poses of all pairs: that of VGGT, Pi3 or Depth Anything 3 (da3), by bins of a
-            degree, or the exact one of papers on matching
-        empty: J of a frame in which nothing moves and nothing is found: 1 (davis) or 0 (vggt4d)
+        depth_align: alignment of video depth to the ground truth: scale, ten rounds of reweighted least squares, as in
+            MonST3R and CUT3R; least-absolute, the scale with the least absolute error; scale-shift, scale and shift
+            with the least absolute error; median, the ratio of the medians; metric, none
+        pairs: how relative poses of all pairs and their AUC are computed: vggt, pi3 or da3 (Depth Anything 3), as their
+            evaluations do it, with bins of one degree; matching, the exact AUC of papers on matching
+        empty: region similarity J (IoU) of a frame in which nothing moves and nothing is found: 1 (davis) or 0 (vggt4d)
         strict: refuse a sequence of which a frame lacks a picture, depth, mask, pose or result, or has a map of another
             size; the other frames are scored by default
     """

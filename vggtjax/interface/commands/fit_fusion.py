@@ -93,6 +93,8 @@ class PassOptions(Options):
 
     method: tyro.conf.Suppress[MethodName] = "4dvggt-d"
     refine_mask: tyro.conf.Suppress[bool | None] = None
+    refine_cameras: tyro.conf.Suppress[bool] = False
+    consistent_depth: tyro.conf.Suppress[bool] = False
 
 
 @dataclass(frozen=True)

@@ -77,11 +77,13 @@ def _refine_mask(refine_mask: Switch = False, no_refine_mask: Switch = False) ->
     return True if refine_mask else False if no_refine_mask else None
 
 
-_DEVICES = "share the frames of a clip among so many devices, each with a copy of the weights"
-_NO_MEMORY_CHECK = "run all frames together, without comparing the memory that they need with what is free"
+_DEVICES = "share the frames of a clip among this many devices, each with a copy of the weights"
+_NO_MEMORY_CHECK = (
+    "do not compare the memory that a clip needs with what is free; without windows, all frames are run together"
+)
 _UNDISTORT = (
-    "make frames of a capture with coefficients of its lens those of a pinhole camera (the default), or\n"
-    "leave them as they are and ignore the coefficients"
+    "undistort the frames of a capture that states the distortion coefficients of its lens (the default);\n"
+    "--no-undistort keeps the distorted frames and ignores the coefficients"
 )
 _PAD_FRAMES = (
     "pad clips to one of a few lengths, so that clips of similar length share compiled programs; for many\n"
@@ -119,7 +121,7 @@ _FIELDS: dict[type, dict[str, Look]] = {
         "compute_dtype": _in_words(name="dtype", reads=_DTYPE | None),
         "attention": _in_words(),
     },
-    Framing: {"mode": lambda hint: Annotated[hint, tyro.conf.arg(name="preprocess")]},
+    Framing: {"mode": lambda hint: Annotated[hint, tyro.conf.arg(name="preprocess", help_behavior_hint="")]},
     Sampling: {"skip": _in_words("N,N-N")},
     KnownGeometry: {
         "intrinsics": _in_words("FX,FY,CX,CY|FILE|source|exif"),

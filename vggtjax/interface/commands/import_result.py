@@ -27,8 +27,10 @@ def import_result(
         source: the folder.
         out: folder for our files; an earlier result in it is replaced.
         format: the program whose files the folder has.
-        quaternion: order of the quaternions in pred_traj.txt: wxyz as MonST3R and VGGT4D write it, or xyzw.
-        confidence_percentile: percent of the pixels, the least confident, to leave out of the point clouds.
+        quaternion: order of the quaternions in pred_traj.txt, required for vggt4d, monst3r, easi3r, das3r and pomato:
+            wxyz as these programs write it, or xyzw; not for other formats.
+        confidence_percentile: leave out this percentage of the pixels, those of the lowest confidence, from the point
+            clouds; at least 0 and less than 100.
     """
     saving = Saving(confidence_percentile=confidence_percentile)
     report = Report()

@@ -23,7 +23,8 @@ def info(
     Args:
         model: "demo", a converted .safetensors, a PyTorch checkpoint, or a hub id; or a video, a picture, a folder of
             pictures, or a capture: frames, size, length, the focal length that the camera states, the lens.
-        config: JSON file with the configuration of a PyTorch checkpoint that is not VGGT-1B.
+        config: JSON file with the configuration of a PyTorch checkpoint; not needed for published weights (VGGT-1B,
+            Depth Anything 3).
     """
     report = Report()
     with report.running():

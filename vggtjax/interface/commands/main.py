@@ -65,20 +65,23 @@ COMMANDS = {
     "view": Command(view, _RESULTS, "play results in a browser, or write them as one page"),
     "render": Command(render, _RESULTS, "films of a result: around it, or along its cameras"),
     "app": Command(app, _RESULTS, "a page to drop a video on"),
-    "export": Command(export, _RESULTS, "a result as files of another program"),
-    "import": Command(import_result, _RESULTS, "a result of another program as ours"),
-    "info": Command(info, _MODELS, "what a model is made of, or a clip is"),
-    "convert": Command(convert, _MODELS, "a PyTorch checkpoint as one .safetensors"),
-    "check-weights": Command(check_weights, _MODELS, "a model's numbers, beside those of the public code"),
+    "export": Command(export, _RESULTS, "write a result for another program, such as COLMAP or Blender"),
+    "import": Command(import_result, _RESULTS, "convert a result of another program, such as MonST3R"),
+    "info": Command(info, _MODELS, "what a model is: configuration, size; or a clip: frames, lens"),
+    "convert": Command(convert, _MODELS, "convert PyTorch weights to one .safetensors"),
+    "check-weights": Command(check_weights, _MODELS, "compare a model's outputs with those of the public PyTorch code"),
     "train": Command(train, _MODELS, "train a model on generated scenes, or finetune one"),
     "calibrate-cues": Command(calibrate_cues, _MODELS, "choose a model's motion cues"),
-    "fit-fusion": Command(fit_fusion, _MODELS, "fit how the two passes are fused"),
+    "fit-fusion": Command(fit_fusion, _MODELS, "fit a rule that fuses the depth of the two passes"),
     "evaluate": Command(evaluate, _MEASURE, "score methods on a data set with ground truth"),
     "scenes": Command(scenes, _MEASURE, "generate clips with exact ground truth"),
     "doctor": Command(doctor, _COMPUTER, "versions, devices, memory, the longest clips, extras, the cache"),
 }
 
-_OUT_OF_MEMORY = "out of memory; take fewer frames (--max-frames, --stride) or a smaller --size"
+_OUT_OF_MEMORY = (
+    "out of memory; close other programs, or give the command less work, such as fewer frames (--max-frames, --stride) "
+    "or a smaller --size where it has these options"
+)
 _OLD_FLAGS = {"--mode": "--preprocess"}  # still understood
 _GONE = {  # a command, or one with a flag, or with a flag and its value: what to take instead
     "app --token": "--password sets what people sign in with, as the user vggtjax",

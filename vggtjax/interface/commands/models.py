@@ -61,8 +61,9 @@ class ModelFiles:
     Attributes:
         model: a converted .safetensors, a PyTorch checkpoint, a hub id such as facebook/VGGT-1B, or demo, the small
             demonstration model, which is not for real footage
-        config: JSON file with the configuration of a PyTorch checkpoint; needed unless it is VGGT-1B
-        revision: commit of a hub id, 40 hexadecimal letters; by default the newest one of the first use
+        config: JSON file with the configuration of a PyTorch checkpoint; not needed for published weights (VGGT-1B,
+            Depth Anything 3)
+        revision: commit of a hub id, 40 hexadecimal digits; by default the one that was newest at the first use
         fusion: file of a fitted rule of fusion, as vggtjax fit-fusion writes it; the paper's rule by default
     """
 

@@ -88,7 +88,7 @@ class OneClip:
         begun = unfinished_cut(self._out) if windows.window is None and not needs_all else None
         if begun is not None:
             windows = Windows(*begun)
-            text = "holds a run in windows that was stopped: it goes on; --window 0 runs all frames together"
+            text = "holds an interrupted run in windows, which is resumed; --window 0 runs all frames together"
             self._report.note(f"{self._out} {text}")
         if windows.window:
             count = self._counted(windows)
@@ -116,7 +116,8 @@ class OneClip:
             why = f"but {' and '.join(needs_all)} {verb} all frames at once: they are run together"
             self._report.note(f"{choice.sizes}, {why}")
         else:
-            self._report.note(f"{choice.sizes}: that may not be enough")
+            again = "if memory runs out, the clip is run once more, in smaller windows or at a smaller size"
+            self._report.note(f"{choice.sizes}: that may not be enough; {again}")
         return windows, count
 
     def _counted(self, windows: Windows) -> int | None:

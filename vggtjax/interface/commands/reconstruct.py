@@ -71,7 +71,7 @@ def reconstruct(
         for folder in samplings:
             check_folder(folder, recipe.saving.names(tracks=given.tracks is not None))
         taken = opened.paths if isinstance(opened, ImageFiles) else [getattr(opened, "path", out)]
-        check_no_part(taken, out, what="a source of the next one, which would replace it")
+        check_no_part(taken, out, what="is an input of this run, which would replace that result; choose another --out")
         network, fitted, options = files.load_fastest(report, recipe.options, [recipe.options.method])
         recipe = dataclasses.replace(recipe, options=options)
         from vggtjax.interface.commands.one_clip import OneClip

@@ -36,15 +36,15 @@ def render(
     Args:
         result: folder of a result.
         path: orbit swings around the scene, camera follows the filming camera.
-        seconds: length of the film.
-        size: width x height in pixels.
-        fps: frames per second.
-        out: the film, an .mp4, .gif or .webp; RESULT/preview/turntable.mp4 by default, RESULT/turntable.mp4 where
-            the result has no previews, where the next film replaces it.
+        seconds: length of the film, in seconds; at most 10000 frames.
+        size: width x height in pixels, each from 16 to 4096.
+        fps: frames per second, up to 120, for a .gif up to 50.
+        out: the film, an .mp4, .gif or .webp; by default RESULT/preview/turntable.mp4, or RESULT/turntable.mp4 without
+            a folder preview; the default file is replaced without --overwrite.
         overwrite: replace the file if it exists.
         format: the program whose files the folder has.
-        quaternion: order of the quaternions in pred_traj.txt, where the format has one: wxyz as MonST3R and VGGT4D
-            write it, or xyzw.
+        quaternion: order of the quaternions in pred_traj.txt, required for vggt4d, monst3r, easi3r, das3r and pomato:
+            wxyz as these programs write it, or xyzw; not for other formats.
     """
     sides = _sides(size)
     report = Report()
@@ -60,7 +60,7 @@ def render(
         check_film(film, fps)
         check_file(film, overwrite=overwrite or out is None, sources=[result])
         if out is not None:
-            check_no_part([film], result, what="no film replaces it", foreign=format != "vggtjax")
+            check_no_part([film], result, what="no film replaces it; choose another name", foreign=format != "vggtjax")
         with report.stage("read"):
             loaded = Reconstruction.load(result, format=format, quaternion=quaternion)
         if not film.parent.is_dir():

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 import tyro
 
 from vggtjax.errors import InputError
+from vggtjax.interface.commands.flags import InWords
 from vggtjax.interface.commands.report import Report
 
 
@@ -17,12 +18,13 @@ class Images:
     """How the images are drawn.
 
     Attributes:
-        frames: of each scene.
+        frames: frames of each scene, 1 to 1000.
         height: of the images, in pixels.
         width: of the images, in pixels.
-        samples: rays per pixel along each side, averaged in the image.
-        shutter: share of the time between frames in which the shutter is open, for motion blur; needs exposures.
-        exposures: instants that motion blur averages over.
+        samples: rays per pixel along each side, averaged in the image; 1 to 8.
+        shutter: share of the time between frames in which the shutter is open, for motion blur, from 0 to 1; above 0 it
+            needs --exposures of at least 2.
+        exposures: instants that motion blur averages over, 1 to 64; above 1 it needs a --shutter above 0.
     """
 
     frames: int = 24
@@ -38,7 +40,7 @@ def scenes(
     *,
     count: int = 8,
     images: Annotated[Images, tyro.conf.OmitArgPrefixes] = Images(),
-    assets: Path | None = None,
+    assets: InWords[Path | None] = None,
     kind: Literal["static", "dynamic"] = "dynamic",
     split: Literal["training", "test"] = "training",
     seed: int = 0,
@@ -50,7 +52,7 @@ def scenes(
         count: number of scenes.
         images: how the images are drawn.
         assets: folder of textures/, photos/ and objects/, for rooms, streets and landscapes of these instead of rooms
-            of simple shapes.
+            of simple shapes; none by default.
         kind: "static", or "dynamic" where one to three objects move (of assets one to four), not always in view.
         split: of the textures, and of the assets; the two splits share no pixels of a photograph.
         seed: another seed draws other scenes.

@@ -38,8 +38,8 @@ def train(
         recipe: JSON file with the recipe.
         out: folder for the model, checkpoints and metrics; an existing run in it is resumed.
         init: a model to start from: "demo", a .safetensors, a PyTorch checkpoint, or a hub id; random parameters by
-            default. The recipe's image size, cues and number of masked pairs replace those of the model, and its
-            new pairs are added.
+            default. The recipe's image size, cues and number of masked pairs replace those of the model, and the
+            recipe's new pairs of blocks (start.new_pairs) are added.
         steps: total number of steps; phases, warm-up and decay keep their shares. The recipe's own by default.
         options: how the run logs, saves and ends.
     """
@@ -64,7 +64,7 @@ def train(
                 from vggtjax.pipeline.pretrained.load import load_weights
 
                 model = load_weights(init, config=chosen.initial_model, progress=progress)
-        report.note("the first step compiles, once for each size of a phase: seconds to minutes")
+        report.note("the first step with each phase and clip size compiles, which takes seconds to minutes")
         with report.stage("train") as advance:
             shown = time.perf_counter()
 

@@ -40,7 +40,7 @@ class Serving:
     Attributes:
         host: address to serve on: this machine alone by default; on any other address the viewer asks for a token,
             which is printed
-        port: 0 takes a free one
+        port: port to serve on; 0 takes a free one
         no_browser: open no browser; over ssh none is opened
     """
 
@@ -67,8 +67,8 @@ def view(
             viewer is served.
         overwrite: replace the file if it exists.
         format: the program whose files the folders have.
-        quaternion: order of the quaternions in pred_traj.txt: wxyz as MonST3R and VGGT4D write it, or xyzw;
-            only their formats need it.
+        quaternion: order of the quaternions in pred_traj.txt, required for vggt4d, monst3r, easi3r, das3r and pomato:
+            wxyz as these programs write it, or xyzw; not for other formats.
         serving: where the viewer is served
     """
     if not results:
@@ -87,7 +87,9 @@ def view(
         if export is not None:
             check_file(export, overwrite=overwrite, sources=results)
             for path in results:
-                check_no_part([export], path, what="no page replaces it", foreign=format != "vggtjax")
+                check_no_part(
+                    [export], path, what="no page replaces it; choose another name", foreign=format != "vggtjax"
+                )
         with report.stage("read") as progress:
             from vggtjax.results.reconstruction import Reconstruction
 

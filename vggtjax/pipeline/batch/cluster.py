@@ -113,7 +113,8 @@ def _computed(
         while left:
             done, _ = ray.wait(list(calls), timeout=_PATIENCE)
             if not done and first is None:
-                note(f"no worker has begun; the cluster is asked for {count} of {cpus} CPUs and {gpus:g} GPUs each")
+                each = f"{cpus} CPUs and {gpus:g} GPUs each"
+                note(f"no worker has started; the cluster is asked for {count} workers with {each}")
             for call in done:
                 worker, name = calls.pop(call)
                 try:
@@ -121,12 +122,12 @@ def _computed(
                 except RayError as problem:  # the worker's process ended twice, or never began
                     said = _short(problem)
                     if name is not None:
-                        answer = failed(name, ClusterError(f"two workers ended with it in their work: {said}"))
+                        answer = failed(name, ClusterError(f"the worker process died twice on this clip: {said}"))
                     elif calls and not isinstance(problem, RayTaskError):  # the others go on
                         note(f"a worker ended before it was ready: {said}")
                         continue
                     else:
-                        raise ClusterError(f"a worker cannot begin: {said}") from problem
+                        raise ClusterError(f"a worker cannot start: {said}") from problem
                 if isinstance(answer, ClipOutcome):
                     left -= 1
                     yield answer
@@ -143,7 +144,9 @@ def _checked(ready: Any, first: Any, out: Destination, note: Note) -> Any:
     """Begin with the first worker that is ready, and return it. Raises ClusterError for one that differs from it."""
     versions, settings, warning = ready
     if versions != running_versions():
-        raise ClusterError(f"a worker runs {versions}, this command {running_versions()}; install the same everywhere")
+        raise ClusterError(
+            f"a worker runs {versions}, this command {running_versions()}; install the same versions on all machines"
+        )
     if first is None:
         out.begin(settings)
         note(warning or "the first worker is ready")

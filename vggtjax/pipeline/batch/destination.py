@@ -167,7 +167,8 @@ def _check_settings(place: str, earlier: dict[str, Any], settings: dict[str, Any
             for name in names[:_MOST_NAMED]
         )
         raise InputError(
-            f"{place} has other settings than this run ({others}); choose another folder, or move the file away"
+            f"{place} has other settings than this run ({others}); use the earlier settings to resume, or choose "
+            "another folder"
         )
 
 

@@ -76,7 +76,11 @@ def _with_intrinsics(result: AnyResult, given: Given, notes: dict[str, str]) -> 
     name = "shared focal length" if given.intrinsics is None else "intrinsics"
     intrinsics = shared_focal(result) if given.intrinsics is None else given.intrinsics
     if given.options.intrinsics == SOURCE and given.capture is not None and given.capture.distorted:
-        logger.warning("the lens of %s has a distortion, which its intrinsics leave out", given.capture.path)
+        logger.warning(
+            "the lens of %s has a distortion, which its intrinsics do not describe: points near the borders of the "
+            "pictures are off; undistort the pictures (the default where the coefficients are known)",
+            given.capture.path,
+        )
     change = np.log(intrinsics[:, [0, 1], [0, 1]] / result.intrinsics[:, [0, 1], [0, 1]])
     focal = np.median(intrinsics[:, 0, 0] * result.source_scale[:, 0])
     across, down = np.expm1(np.median(change, axis=0))

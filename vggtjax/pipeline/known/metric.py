@@ -69,7 +69,8 @@ def from_camera_height(result: Result, height: float) -> MetricScale:
     points = points[:: max(1, len(points) // _POINTS)]
     if len(points) < 100:
         raise InputError(
-            f"camera_height needs static points of the floor; only {len(points)} points are static and sure"
+            f"camera_height needs at least 100 static points with confident depth, and there are {len(points)}; give a "
+            "baseline or known depths"
         )
     down = result.camera_from_world[:, 1, :3].astype(np.float64).mean(axis=0)
     down /= max(float(np.linalg.norm(down)), 1e-9)

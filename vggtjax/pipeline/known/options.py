@@ -33,20 +33,24 @@ class KnownGeometry:
             3 matrix or with four numbers or nine a line, for all frames or for each; source: those of the capture's
             folder; exif: the focal length that the camera wrote into the pictures or the video
         shared_focal: one focal length for the whole clip, the median of the predicted ones
-        poses: known camera poses, world-from-camera: TUM's eight numbers a line, KITTI's twelve, or sixteen; source:
-            those of the capture's folder
+        poses: known camera poses, world-from-camera, in OpenCV's axes (x right, y down, z forward): TUM's eight numbers
+            a line, KITTI's twelve, or sixteen; source: those of the capture's folder
         quaternion: order of the quaternions in the file of poses: wxyz as MonST3R, CUT3R and VGGT4D write them, or xyzw
-            as TUM does; by default what the names of its columns say, or xyzw
-        baseline: metric scale: the distance between the cameras of frames I and J, such as 0,7,0.85
+            as TUM does; by default what the names of its columns say, or xyzw; required for a file named pred_traj.txt
+            without names of columns
+        baseline: metric scale: the distance in metres between the cameras of frames I and J, such as 0,7,0.85; I and J
+            are counted from 0 among the frames that are taken
         camera_height: metric scale: the mean height of the cameras above the floor, in metres
         known_depths: metric scale: a folder of depth maps, of a depth model or a lidar, named like the frames (.npz,
-            .npy or .exr in metres, .png of 16 bits); a CSV file with columns frame, x, y and depth, in pixels of the
-            source and metres; source: the depth maps of the capture's folder
-        depths_per_metre: steps of 16-bit pictures and of whole numbers in a folder of depth maps to the metre; 1000 by
-            default
-        robust: known depths that differ from most others count nothing: for maps with many wrong values, such as a
-            third
-        leave_out: folder of pictures, one per frame, bright where depth is left out, such as in the sky
+            .npy or .exr in metres, .png of 16 bits); a CSV file with columns frame (counted from 0 among the frames
+            that are taken), x, y and depth, in pixels of the source and metres; source: the depth maps of the capture's
+            folder
+        depths_per_metre: integer values per metre in depth maps of whole numbers (16-bit .png, integer .npy or .npz);
+            1000 by default, which is millimetres
+        robust: estimate the scale robustly (Tukey's biweight instead of the median): outliers among the known depths
+            get no weight; for maps with many wrong values, such as a third
+        leave_out: folder of mask pictures, named as for masks of what moves, white where depth is left out, such as in
+            the sky
     """
 
     intrinsics: str | None = None

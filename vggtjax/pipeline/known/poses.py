@@ -167,7 +167,8 @@ def check_agreement(
 ) -> PoseAgreement:
     """Compare predicted with known poses; raises InputError for poses of another clip or in another convention."""
     found = agreement(camera_from_world, known)
-    words = f"the poses of {name} do not fit: they differ from the predicted ones by {found.turn_median:.0f} degrees"
+    turn = f"{found.turn_median:.0f} degrees (median)"
+    words = f"the poses of {name} do not fit: they are turned from the predicted ones by {turn}"
     others = {
         "in OpenGL's axes (y up, z backward)": np.diag([1.0, -1.0, -1.0]) @ known,
         "as camera-from-world": world_from_camera(known)[:, :3],
@@ -179,13 +180,14 @@ def check_agreement(
     if _residual(found) > _RESIDUAL and _residual(read[convention]) < _LESS * _residual(found):
         left, offset = read[convention].turn_median, read[convention].centres
         raise InputError(
-            f"{words} in the middle and {found.centres:.0%} of their path, and by {left:.1f} degrees and {offset:.0%} "
-            f"if read {convention}; expected world-from-camera poses in OpenCV's axes (x right, y down, z forward)"
+            f"{words}, and their centres differ by {found.centres:.0%} of the path; if read {convention}, by "
+            f"{left:.1f} degrees and {offset:.0%}; expected world-from-camera poses in OpenCV's axes (x right, y down, "
+            "z forward)"
         )
     if found.turn_median > _MOST_TURN:
         raise InputError(
-            f"{words} in the middle, up to {found.turn_most:.0f}, and by {found.centres:.0%} of their path; expected "
-            "poses of these frames"
+            f"{words}, at most {found.turn_most:.0f}, and their centres differ by {found.centres:.0%} of the path; "
+            "expected poses of these frames"
         )
     return found
 

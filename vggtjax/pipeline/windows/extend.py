@@ -200,8 +200,9 @@ def _check_method(result: Reconstruction, options: Options, fusion: FusionParams
     if options.method != result.method:
         raise InputError(f"method is {options.method!r}; expected that of the result, {result.method!r}")
     if (known := result.settings.get("fusion")) != fusion_digest(fusion):
-        rule = "the paper's rule" if known is None else "a rule of its own"
-        raise InputError(f"the result is fused by {rule}, and another one is given; expected the same (--fusion)")
+        if known is None:
+            raise InputError("the result was made with the paper's rule of fusion; leave --fusion out")
+        raise InputError("the result was made with a fitted rule of fusion; give the same file with --fusion")
 
 
 def _check_clip(result: Reconstruction, clip: Clip, names: list[str]) -> None:
@@ -231,7 +232,7 @@ def _kept_windows(out: Path, settings: Mapping[str, Any]) -> Iterator[WindowStor
     with locked_folder(out / FOLDER, "the windows of a clip"):
         store = WindowStore(out, settings)
         try:
-            with kept(lambda: f"{store.count()} windows are kept; the same command goes on from there"):
+            with kept(lambda: f"{store.count()} windows are kept; run the same command again to resume"):
                 yield store
         except PlaceError:
             store.remove()

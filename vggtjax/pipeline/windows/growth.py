@@ -231,10 +231,14 @@ class Growth:
         best = max(float(self._overlaps[frames].max()), 0.0)
         names = [self.names[frame] for frame in frames]
         if some_move and best >= self._bound:
-            return PlaceError(f"{_listed(names)} overlap only with frames on which nearly everything moves", names)
+            return PlaceError(
+                f"nearly everything moves on the known frames that overlap with {_listed(names)}; leave the new frames "
+                "out, or add frames that overlap with other known frames",
+                names,
+            )
         return PlaceError(
-            f"{_listed(names)} show another place: they overlap with the known frames by at most {best:.2f}, and "
-            f"frames of one place overlap by at least {self._bound:g}; leave them out, or add frames in between",
+            f"no known frame shows the place of {_listed(names)}: the largest overlap is {best:.2f}; expected at least "
+            f"{self._bound:g}; leave them out, or add frames in between",
             names,
         )
 

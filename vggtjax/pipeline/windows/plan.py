@@ -17,12 +17,12 @@ class Windows:
     """How a long clip is cut: without a window, or with window 0, not at all. Raises InputError for a bad value.
 
     Attributes:
-        window: run the clip in windows of so many frames and join them: memory then does not depend on the clip's
-            length; 0 runs all frames together; by default they are run together where they fit in memory, else in
-            windows of up to 64
+        window: run the clip in windows of this many frames, at least 4, and join them: memory then does not depend on
+            the clip's length; 0 runs all frames together; by default they are run together where they fit in memory,
+            else in windows of up to 64
         overlap: frames that neighbouring windows share, at least 2 and at most half a window; a quarter of a window by
             default
-        no_loops: do not look for places that the camera comes back to
+        no_loops: no loop closure: do not join windows in which the camera comes back to the same place
     """
 
     window: int | None = None
@@ -48,7 +48,7 @@ class Windows:
         return LEAST_OVERLAP if self.overlap is None else self.overlap
 
     def cuts(self, frames: int) -> bool:
-        """Return whether a clip of so many frames is cut: it is longer than a window."""
+        """Return whether a clip of this many frames is cut: it is longer than a window."""
         return bool(self.window) and frames > self.window
 
 
@@ -58,10 +58,10 @@ class Extending:
 
     Attributes:
         prefix: letters before the names of the new frames, such as day2_, where they have names of old ones
-        window: frames that are run together: anchors and new ones
+        window: frames that are run together, anchors and new ones; more than --anchors
         anchors: how many of them are frames that are known already, at least 3
-        least_overlap: frames that overlap by less, from 0 to 1, show another place; measured with the demonstration
-            model alone
+        least_overlap: new frames whose overlap with known frames is less than this, between 0 and 1, count as another
+            place; the default was chosen with the demonstration model only
     """
 
     prefix: str = ""

@@ -240,7 +240,7 @@ def run_windows(
             logger.info("%d of %d windows are kept from a run that was stopped", before, len(cut))
 
         def stopped() -> str:
-            return f"{store.count()} of {len(cut)} windows are kept; the same command goes on from there"
+            return f"{store.count()} of {len(cut)} windows are kept; run the same command again to resume"
 
         with kept(stopped), stage("windows") as progress:
             for number, clip in enumerate(chain([first], clips)):

@@ -56,8 +56,9 @@ class Exporting:
     """Which points an export holds, and how fine a mesh is. Raises InputError for a value out of range.
 
     Attributes:
-        points: most static points to write; moving points get as many in each frame
-        confidence_percentile: percent of the pixels, the least confident, to leave out of the points, or of a mesh
+        points: write at most this many static points, and at most this many moving points in each frame
+        confidence_percentile: leave out this percentage of the pixels, those of the lowest confidence, from the points
+            or the mesh; at least 0 and less than 100
         voxel_size: edge of the voxels of a mesh, in units of the result; by default as wide as a pixel on the surfaces,
             or wider where the frames differ by more
     """
