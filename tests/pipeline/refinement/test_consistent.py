@@ -63,6 +63,7 @@ def test_depth_and_cameras_come_to_the_truth(corner, pictures, truth, predicted)
     before, after = (np.array(errors(each, truth, corner)) for each in (predicted, made))
     assert report.changed
     assert (after < [0.4 * before[0], 0.1 * before[1]]).all()
+    assert report.layers_before is not None
     assert report.layers_after < 0.3 * report.layers_before
     assert report.joined > 0.5
     assert made.settings["consistency"]["sentence"] == report.sentence == made.known_facts["depth"]
@@ -78,21 +79,30 @@ def test_cameras_that_are_far_off_are_found(corner, pictures, truth):
     assert errors(made, truth, corner)[1] < 0.2
 
 
+def test_frames_that_saw_nothing_in_common_agree_if_they_do_now():
+    nothing, some = np.zeros(0, np.float32), np.full(3, 0.1, np.float32)
+    assert consistent._agree(nothing, some, 1.0)
+    assert not consistent._agree(some, nothing, 1.0)
+    assert not consistent._agree(some, 2 * some, 1.0)
+    report = ConsistencyReport(True, layers_before=None, layers_after=0.01)
+    assert "frames differ by 1.0% (median), saw nothing in common before" in report.sentence
+
+
 def test_a_narrow_clip_has_no_coarse_matches_but_fine_ones(corner, pictures):
     predicted = corner_result(corner, degrees=2, share=0)
-    rows, frames = slice(19, 29), len(pictures)
+    rows, frames = slice(18, 30), len(pictures)
     names = ("images", "depth", "depth_confidence", "dynamic_mask")
     fields: dict[str, Any] = {name: getattr(predicted, name)[:, rows] for name in names}
     fields |= {
-        "intrinsics": predicted.intrinsics - np.array([[0, 0, 0], [0, 0, 19], [0, 0, 0]], np.float32),
-        "source_size": np.tile(np.array([10 * SCALE, WIDTH], predicted.source_size.dtype), (frames, 1)),
-        "valid_box": np.tile(np.array([0, 0, WIDTH // SCALE, 10], predicted.valid_box.dtype), (frames, 1)),
+        "intrinsics": predicted.intrinsics - np.array([[0, 0, 0], [0, 0, 18], [0, 0, 0]], np.float32),
+        "source_size": np.tile(np.array([12 * SCALE, WIDTH], predicted.source_size.dtype), (frames, 1)),
+        "valid_box": np.tile(np.array([0, 0, WIDTH // SCALE, 12], predicted.valid_box.dtype), (frames, 1)),
     }
     strip = dataclasses.replace(predicted, **fields)
-    made, report = consistent_depth(strip, iter(pictures[:, 19 * SCALE : 29 * SCALE]), join=False)
+    made, report = consistent_depth(strip, iter(pictures[:, 18 * SCALE : 30 * SCALE]), join=False)
     assert report.changed
     turned = [rotation_error(each.camera_from_world, corner.camera_from_world) for each in (predicted, made)]
-    assert turned[1] < 0.5 * turned[0]
+    assert turned[1] < 0.3 * turned[0]
 
 
 def test_a_camera_that_stands_gets_one_place_and_keeps_its_depth(predicted, pictures, truth):
@@ -100,6 +110,7 @@ def test_a_camera_that_stands_gets_one_place_and_keeps_its_depth(predicted, pict
     predicted = dataclasses.replace(predicted, depth=depth)
     made, report = consistent_depth(predicted, iter(still), join=False)
     assert "not changed; only the cameras fit pixels in" in report.sentence
+    assert report.layers_before is not None
     assert report.layers_after < report.layers_before
     np.testing.assert_array_equal(made.depth, predicted.depth)
     first = np.repeat(made.camera_from_world[:1], len(still), axis=0)
@@ -131,7 +142,7 @@ def test_cameras_change_alone_where_frames_agree_less_after_the_fields(corner, p
 def test_known_cameras_stay(corner, pictures, truth, predicted):
     known = dataclasses.replace(predicted, camera_from_world=truth.camera_from_world, intrinsics=truth.intrinsics)
     made, _ = consistent_depth(known, iter(pictures), priors=KNOWN)
-    assert rotation_error(made.camera_from_world, truth.camera_from_world) < 0.02
+    np.testing.assert_array_equal(made.camera_from_world, known.camera_from_world)
     np.testing.assert_array_equal(made.intrinsics, known.intrinsics)
     assert errors(made, truth, corner)[0] < 0.3 * errors(known, truth, corner)[0]
 

@@ -101,6 +101,7 @@ def test_masks_of_added_frames_are_named_where_they_were_made_otherwise():
 
     both = joined(given, new, mined)
     assert both.settings["masks"] == "given; mined in added frames"
+    assert given.settings["masks"] == "given"
     again = joined(both, part_of_walk(slice(45, None)), mined)
     assert again.settings["masks"] == both.settings["masks"]
     assert "masks" not in joined(exact(part_of_walk(slice(0, 30))), new, exact).settings

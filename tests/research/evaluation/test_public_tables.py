@@ -68,6 +68,10 @@ def test_tracks_are_scored_as_by_public_code():
     scores = tapvid3d_scores(found, true, found_visible, visible, focal)
     for name, value in scores._asdict().items():
         assert value == pytest.approx(golden[f"tapvid3d_{name}"].item(), abs=1e-6)
+    unknown = ~visible & ~found_visible  # say that their depth is unknown: they do not count
+    counted = tapvid3d_scores(found, true, found_visible, visible, focal, ~unknown)
+    assert counted.oa == pytest.approx((visible & found_visible).sum() / (visible | found_visible).sum())
+    assert (counted.apd, counted.aj) == (scores.apd, scores.aj)
     every = np.ones(visible.shape, bool)
     for align in get_args(TrackAlign):
         errors = world_track_errors(golden["world_found"], true, every, align)

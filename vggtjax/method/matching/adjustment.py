@@ -41,6 +41,7 @@ class Adjustment:
     rotation_prior: float = float(np.radians(6))
     translation_prior: float = 0.1
     focal_prior: float | None = None  # of the log of one factor of all focal lengths; None: intrinsics stay
+    fixed_cameras: bool = False  # only depths move
     damping: float = 1e-3  # of Levenberg and Marquardt, relative to the diagonal; less moves on where little is known
 
 
@@ -148,6 +149,7 @@ def adjust(
     last = jnp.asarray(how.sigma * (how.annealed or (1.0,))[-1], K.dtype)
     outcome = _of_frames(lambda s: _outcome(problem, state, last, s), problem)
     poses = jnp.concatenate([state.rotation, unit * state.translation[..., None]], axis=-1)
+    poses = cameras.camera_from_world if how.fixed_cameras else poses
     position, in_front, information, pull = outcome
     depth = unit * jnp.exp(-state.log_inverse)
     return Static(poses, depth, position, in_front, jnp.exp(state.log_focal), information, pull)
@@ -259,7 +261,7 @@ def _change(of: _Equations, problem: _Problem, state: _State) -> tuple[Float[Arr
     """
     S, how, seen_by = len(of.gradient), problem.how, problem.seen_by
     prior = jnp.repeat(jnp.array([how.rotation_prior, how.translation_prior], of.gradient.dtype) ** -2.0, 3)
-    is_free = np.arange(6 * S) >= 6
+    is_free = np.arange(6 * S) >= (6 * S if how.fixed_cameras else 6)
     H = jnp.zeros((S, S, 6, 6), of.blocks.dtype).at[seen_by[:, :, None], seen_by[:, None, :]].add(of.blocks)
     H = H.swapaxes(1, 2).reshape(6 * S, 6 * S) + jnp.diag(jnp.tile(prior, S))
     g = (jnp.zeros((S, 6), of.blocks.dtype).at[seen_by].add(of.gradient) + prior[None] * state.moved).ravel()

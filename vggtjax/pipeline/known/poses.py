@@ -24,7 +24,7 @@ _MATRICES = (12, 16, 4)  # of three rows, of four, and of four a row a line
 _UNNAMED = "pred_traj.txt"  # of VGGT4D, MonST3R and CUT3R: without names of columns, and the quaternion's w is first
 _FEWEST = 3
 _NO_MOTION = 1e-6  # a path, or its share of the distance from the origin, below which cameras stand still
-_FAR_AWAY = 1e-4  # share of the distance from the origin; the motion loses a thousandth to 32 bits
+_FAR_AWAY = 1e-2  # share of the distance from the origin; steps between frames lose a thousandth to 32 bits
 _MOST_TURN = 45.0  # degrees; poses that differ more in the middle belong to another clip
 _RESIDUAL, _LESS = 5.0, 1 / 3  # of `_residual`; the share of it left in another convention, which is then right
 

@@ -151,6 +151,7 @@ class _Model:
         options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         options.ceres.loss_function_scale = scale
         options.ceres.solver_options.max_num_iterations = _STEPS
+        options.ceres.solver_options.num_threads = 1  # with more, the sums of a run differ from the next run's
         options.ceres.solver_options.function_tolerance = _TOLERANCE
         config = pycolmap.BundleAdjustmentConfig()
         for number in self.model.images:

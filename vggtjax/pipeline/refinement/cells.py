@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, Int, UInt8
 from PIL import Image
 
 from vggtjax.cameras import Cameras
@@ -18,6 +18,7 @@ Box = tuple[float, float, float, float]
 CELLS = 24  # along a frame's longer side
 _PIXELS = 12  # of a cell in the finest pictures that are matched
 _ROUNDING = 1e-6  # pixels of the source
+_FARTHEST = 1e4  # of the median depth, and its inverse: the others have no parallax, or are noise
 
 
 class Cells(NamedTuple):
@@ -27,6 +28,7 @@ class Cells(NamedTuple):
     depth: Float32[np.ndarray, "S P"]
     is_static: Float32[np.ndarray, "S P"]  # the share of a cell's pixels that show a point which does not move
     cameras: Cameras  # intrinsics in cells
+    shown: Float32[np.ndarray, "S 4"]  # left, top, right, bottom of the picture in its padding, in cells; else infinite
 
 
 def cells_of(result: Result) -> Cells:
@@ -35,17 +37,36 @@ def cells_of(result: Result) -> Cells:
     rows, columns = grid = grid_of((height, width))
     known = result.valid_pixels
     unit = np.median(result.depth[known]) if known.any() else 1.0
-    logs = np.log(np.where(known, result.depth, unit), dtype=np.float32)
-    row, column = (
-        np.minimum((np.arange(n) + 0.5) * side / n, side - 1).astype(int)
-        for n, side in zip(grid, (height, width), strict=True)
+    logs = np.log(np.clip(np.where(known, result.depth, unit), unit / _FARTHEST, unit * _FARTHEST), dtype=np.float32)
+    # Of the four pixels around a centre, bilinear; the nearest and the furthest count as the two between them.
+    (row, down), (column, right) = (_around(n, side) for n, side in zip(grid, (height, width), strict=True))
+    last = height - 1, width - 1
+    four = np.stack(
+        [logs[:, np.minimum(row + i, last[0])][:, :, np.minimum(column + j, last[1])] for i in (0, 1) for j in (0, 1)]
     )
-    # The pixel of the centre, and those left and above it: their mean without the nearest and the furthest.
-    four = np.stack([logs[:, np.maximum(row - i, 0)][:, :, np.maximum(column - j, 0)] for i in (0, 1) for j in (0, 1)])
-    depth = np.exp(np.sort(four, axis=0)[1:3].mean(axis=0)).reshape(frames, -1)
+    low, high = np.sort(four, axis=0)[1:3]
+    down, right = down[:, None], right[None]
+    shares = np.stack([(1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right])
+    depth = np.exp((shares[:, None] * np.clip(four, low, high)).sum(axis=0)).astype(np.float32).reshape(frames, -1)
     static = (known & ~result.dynamic_mask).astype(np.uint8) * 255
     shares = [np.asarray(Image.fromarray(each).resize((columns, rows), Image.Resampling.BOX)) for each in static]
-    return Cells(grid, depth, np.stack(shares).reshape(frames, -1) / np.float32(255), cameras_in_cells(result, grid))
+    static_shares = np.stack(shares).reshape(frames, -1) / np.float32(255)
+    return Cells(grid, depth, static_shares, cameras_in_cells(result, grid), _shown(result, grid))
+
+
+def _shown(result: Result, grid: tuple[int, int]) -> Float32[np.ndarray, "S 4"]:
+    """Return left, top, right and bottom of the pictures within their padding, in cells; infinite without padding."""
+    height, width = result.depth.shape[1:]
+    ends = np.array([0, 0, width, height])
+    box = np.where(result.valid_box == ends, np.array([-np.inf, -np.inf, np.inf, np.inf]), result.valid_box)
+    return (box * np.tile([grid[1] / width, grid[0] / height], 2)).astype(np.float32)
+
+
+def _around(cells: int, side: int) -> tuple[Int[np.ndarray, " N"], Float32[np.ndarray, " N"]]:
+    """Return the first of the two pixels around each cell's centre, along a side, and the share of the second."""
+    place = np.clip((np.arange(cells) + 0.5) * side / cells - 0.5, 0, side - 1)
+    first = np.floor(place).astype(int)
+    return first, (place - first).astype(np.float32)
 
 
 def cameras_in_cells(result: Result, grid: tuple[int, int]) -> Cameras:

@@ -53,7 +53,7 @@ class ConsistencyReport:
     cells: float = 0.0  # share of the cells whose depth matched pixels tell; that match, if cameras change alone
     points: int = 0  # observations of bundle-adjusted points
     change: float = 0.0  # mean |log| by which depth changed
-    layers_before: float = 0.0  # median |log| between the depths of frames that see one place
+    layers_before: float | None = 0.0  # median |log| between depths of frames that see one place; None: none did
     layers_after: float = 0.0
     joined: float = 0.0  # share of the static pixels whose depth is the mean of several frames
 
@@ -65,9 +65,10 @@ class ConsistencyReport:
         points = f" and {self.points} observations of points" if self.points else ""
         joined = f"; {self.joined:.0%} of the static pixels are joined" if self.joined else ""
         by = f"changed by {self.change:.1%} on average, to fit" if self.change else "not changed; only the cameras fit"
+        before = "saw nothing in common" if self.layers_before is None else f"{self.layers_before:.1%}"
         return (
             f"{by} pixels in {self.cells:.0%} of the picture{points}; "
-            f"frames differ by {self.layers_after:.1%} (median), {self.layers_before:.1%} before{joined}"
+            f"frames differ by {self.layers_after:.1%} (median), {before} before{joined}"
         )
 
 
@@ -120,7 +121,7 @@ def consistent_depth(
         )
     grey = grey_pictures(result, pictures, cells.grid)
     starts = []
-    if points is None and priors.rotation >= PREDICTED.rotation:  # neither bundle-adjusted nor known cameras
+    if points is None and not priors.fixed:  # neither bundle-adjusted nor known cameras
         starts = [turned] if (turned := turned_by_features(cells, grey, on_frame=step)) is not None else []
     world = adjust_to_pixels(cells, grey, priors, on_round=step, starts=starts)
     if points is not None and _turned(start, world) > _MOST_TURNED:
@@ -154,13 +155,18 @@ def consistent_depth(
         made, share = _joined(made, tolerance_of(after), step)
         after = differences(made, step)
     tell(total, total)
-    layers = (float(np.median(before)), float(np.median(after)))
+    layers = (float(np.median(before)) if len(before) else None, float(np.median(after)))
     observations = 0 if points is None else len(points.frame)
     return _reported(made, ConsistencyReport(True, "", told, observations, change, *layers, share))
 
 
 def _agree(before: Float32[np.ndarray, " N"], after: Float32[np.ndarray, " M"], most: float) -> bool:
-    """Return whether the median difference of frames is at most so many times as large as before."""
+    """Return whether the median difference of frames is at most so many times as large as before.
+
+    Frames that saw nothing in common before, as their cameras were far off, agree if they do now.
+    """
+    if not len(before):
+        return len(after) > 0
     return len(after) > 0 and bool(np.median(after) <= most * np.median(before))
 
 

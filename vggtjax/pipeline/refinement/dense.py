@@ -52,10 +52,11 @@ class CameraPriors:
     rotation: float = float(np.radians(6))
     translation: float = 0.2
     focal: float | None = 0.15  # of the log of one factor; None: intrinsics stay
+    fixed: bool = False  # the cameras stay, and their priors are not read
 
 
 PREDICTED = CameraPriors()
-KNOWN = CameraPriors(float(np.radians(0.01)), 0.0005, None)
+KNOWN = CameraPriors(focal=None, fixed=True)
 
 
 class DenseWorld(NamedTuple):
@@ -90,6 +91,7 @@ def _adjust(
         rotation_prior=priors.rotation,
         translation_prior=priors.translation,
         focal_prior=priors.focal,
+        fixed_cameras=priors.fixed,
         damping=_DAMPING,
     )
     return adjust(depth, cameras, matched, weight, grid, how, predicted)
@@ -128,10 +130,9 @@ def adjust_to_pixels(
     for each in rounds:
         pictures = at_scale(grey, cells.grid, each.pixels)
         fits = [fit for start in begun if (fit := _fit(cells, pictures, start, each, priors)) is not None]
-        if fits:
-            best = _best(fits)
+        if fits and np.isfinite((best := _best(fits)).agreement):
             begun, world = [best.start], _measured(cells, best, each)
-        else:  # such as windows that are larger than the coarse pictures of a narrow clip
+        else:  # such as windows that are larger than the coarse pictures of a narrow clip, or numbers that overflow
             world = nothing
         on_round()
     return world
@@ -171,7 +172,7 @@ def _fit(
     K = cells.cameras.intrinsics.astype(np.float32)
     cameras = Cameras(start.poses, zoomed(K, start.focal))
     expected, warp = expected_matches(start.depth, cameras, cells.grid)
-    found = match_pixels(pictures, expected, warp, cells.grid, each.window)
+    found = match_pixels(pictures, expected, warp, cells.grid, each.window, cells.shown)
     weight = found.weight * cells.is_static[:, None]
     if not weight.any():
         return None

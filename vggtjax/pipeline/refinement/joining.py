@@ -23,6 +23,7 @@ from vggtjax.results.visible import inside_box, show_points
 _TIMES = 4.0  # the tolerance is so many median differences between frames
 _TOLERANCE = (0.01, 0.2)  # of log depth: its range
 _COARSE = 3  # pixels; the median difference is taken over every third pixel, both ways
+_MOST_WEIGHT = 1e30  # of a confidence: sums of it and of many frames stay finite
 _NEAREST = 1e-3  # of depth in the other frame, over that in its own
 
 _AXES = np.array([0, 1])
@@ -82,7 +83,7 @@ def _surface(result: Result, frame: int) -> Surface:
     depth, confidence = result.depth[frame], result.depth_confidence[frame]
     known = show_points(depth, confidence, inside_box(result.valid_box[frame], depth.shape))
     static = known & ~result.dynamic_mask[frame]
-    weight = np.where(static, np.maximum(confidence, np.finfo(np.float32).tiny), 0)
+    weight = np.where(static, np.clip(confidence, np.finfo(np.float32).tiny, _MOST_WEIGHT), 0)
     logs = np.log(np.where(known, depth, 1))
     return Surface(logs, weight, result.camera_from_world[frame], result.intrinsics[frame])  # type: ignore[arg-type]
 

@@ -33,6 +33,7 @@ SOURCE = "mined: matched pixels and Gram similarities"
 _PIXELS, _WINDOW = 2, Window(4, 10)  # of a cell; movers can be five cells from where a static world shows them
 _SMALLEST_SCALE = 0.2  # cells; smaller differences are no motion
 _LARGEST = 8.0  # differences beyond this many scales count as this
+_UNKNOWN = 0.25  # quantile of the differences of cells with matches, which the others get: nothing says that they move
 _SURE = 0.1  # weight from which a match tells the scale
 _LEAST_MOTION = 1e-3  # by matches
 _SPECK = 0.25  # of a patch's pixels: smaller regions and holes of the mask are noise
@@ -107,7 +108,7 @@ def pixel_motion(
     """
     S, (h, w), grid = len(grey), saliency.shape[1:], cells.grid
     expected, warp = expected_matches(cells.depth, cells.cameras, grid)
-    found = match_pixels(at_scale(grey, grid, _PIXELS), expected, warp, grid, _WINDOW)
+    found = match_pixels(at_scale(grey, grid, _PIXELS), expected, warp, grid, _WINDOW, cells.shown, strict=True)
     gram = _resized(saliency, grid, Image.Resampling.BILINEAR).reshape(S, -1)
     if (found.weight.sum(axis=1) > LEAST_WEIGHT).mean() < FEWEST_MATCHED:
         return None
@@ -120,13 +121,14 @@ def pixel_motion(
 
 
 def _difference(expected: Float32[np.ndarray, "S M P 2"], found: PixelMatches) -> Float32[np.ndarray, "S P"]:
-    """Return how far cells match from where they are expected, over the clip's median; the middle where unknown."""
+    """Return how far cells match from where they are expected, over the clip's median; little where unknown."""
     distance, weight = np.linalg.norm(found.position - expected, axis=-1), found.weight
     sure = distance[weight > _SURE]
     scale = max(float(np.median(sure)) if len(sure) else 0.0, _SMALLEST_SCALE)
     total = weight.sum(axis=1)
     mean = np.sum(weight * np.minimum(distance / scale, _LARGEST), axis=1) / np.maximum(total, LEAST_WEIGHT)
-    return np.where(total > LEAST_WEIGHT, mean, np.median(mean))
+    known = total > LEAST_WEIGHT
+    return np.where(known, mean, np.quantile(mean[known], _UNKNOWN) if known.any() else 0)
 
 
 def _without_specks(mask: Bool[np.ndarray, "H W"], least: float) -> Bool[np.ndarray, "H W"]:

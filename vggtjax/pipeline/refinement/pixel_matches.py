@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Float32, Int
+from jaxtyping import Array, Bool, Float, Float32, Int
 
 from vggtjax.cameras import Cameras
 from vggtjax.method.matching.matches import FramePairs, frame_pairs, patch_centres
@@ -21,6 +21,7 @@ _LOWEST, _HIGHEST = 0.4, 0.8  # ZNCC of weight 0, and from which a match has its
 _CYCLE = 0.3  # patches; matches that come back further away count little
 _CURVATURE = 0.002  # of the ZNCC's peak by the pixel, across its flattest direction, from which a match has full weight
 _INSIDE = 0.8  # share of a window that must be inside the picture
+_OUTSIDE = -1.0  # score of the others
 _NOISE = 1.3e-6  # variance of rounding to 8 bits, for colours in [0, 1]; windows of less show nothing
 _MOST_STRETCH = 2.0  # of a window
 _MOST_MOVE = 0.75  # pixels by which a parabola moves the best whole shift
@@ -52,6 +53,9 @@ def match_pixels(
     warp: Float32[np.ndarray, "S M P 2 2"],
     grid: tuple[int, int],
     window: Window,
+    shown: Float32[np.ndarray, "S 4"] | None = None,
+    *,
+    strict: bool = False,
 ) -> PixelMatches:
     """Return the best match of every patch near where it is expected.
 
@@ -61,11 +65,17 @@ def match_pixels(
         warp: derivative of the position in the other frame by that in the own.
         grid: rows and columns of patches.
         window: sizes.
+        shown: left, top, right and bottom of the pictures within their padding, in patches; infinite without.
+        strict: leave out matches beside shifts that leave the picture: they are off by up to a pixel. An adjustment with
+            a robust loss gains by them.
     """
     pairs = frame_pairs(len(pictures))
     own, offset = np.nonzero(pairs.exist)
     inputs = (own, pairs.others[own, offset], expected[own, offset], warp[own, offset])
-    found = _slide(jnp.asarray(pictures), *map(jnp.asarray, inputs), grid, window)
+    if shown is None:
+        shown = np.tile(np.array([-np.inf, -np.inf, np.inf, np.inf], np.float32), (len(pictures), 1))
+    side = pictures.shape[1] // grid[0]
+    found = _slide(jnp.asarray(pictures), jnp.asarray(shown * side), *map(jnp.asarray, inputs), grid, window, strict)
     S, M, P, _ = expected.shape
     position, score, curvature = expected.copy(), np.zeros((S, M, P), np.float32), np.zeros((S, M, P), np.float32)
     for into, values in zip((position, score, curvature), found, strict=True):
@@ -75,15 +85,17 @@ def match_pixels(
     return PixelMatches(position, trust.astype(np.float32))
 
 
-@partial(jax.jit, static_argnames=("grid", "window"))
+@partial(jax.jit, static_argnames=("grid", "window", "strict"))
 def _slide(
     pictures: Float[Array, "S H W"],
+    shown: Float[Array, "S 4"],
     own: Int[Array, " K"],
     other: Int[Array, " K"],
     expected: Float[Array, "K P 2"],
     warp: Float[Array, "K P 2 2"],
     grid: tuple[int, int],
     window: Window,
+    strict: bool,
 ) -> tuple[Float[Array, "K P 2"], Float[Array, "K P"], Float[Array, "K P"]]:
     """Return positions in patches, their ZNCC (0 where the best shift is at the rim) and curvature of its peak."""
     side, P = pictures.shape[1] // grid[0], grid[0] * grid[1]
@@ -94,10 +106,12 @@ def _slide(
 
     def of_pair(pair: tuple[Array, ...]) -> tuple[Array, Array, Array]:
         i, j, expected, warp = pair
-        mine = _sample(pictures[i], centres[None] + inner[:, None])  # [n * n, P]
+        own_places = centres[None] + inner[:, None]  # [n * n, P, 2]
+        mine = _sample(pictures[i], own_places)  # [n * n, P]
         mine -= mine.mean(axis=0, keepdims=True)
+        own_share = jnp.mean(_is_in(own_places, shown[i]), axis=0)
         places = (expected * side)[None] + jnp.einsum("pab,kb->kpa", warp, fine)
-        inside = jnp.all((places > 0) & (places < size), axis=-1)
+        inside = jnp.all((places > 0) & (places < size), axis=-1) & _is_in(places, shown[j])
         theirs = jnp.stack([_sample(pictures[j], places), inside.astype(jnp.float32)])
         theirs = theirs.reshape(2, n + shifts - 1, n + shifts - 1, P)
 
@@ -110,15 +124,16 @@ def _slide(
         zeros = (jnp.zeros((shifts, shifts, P)),) * 4
         product, total, square, share = jax.lax.fori_loop(0, n * n, add, zeros)
         energy = jnp.maximum(square - total**2 / n**2, 0) * jnp.sum(mine**2, axis=0)[None, None]
-        scores = jnp.where(share > _INSIDE * n**2, product / jnp.sqrt(energy + _NOISE * n**2), -1)
-        move, score, curvature = _peak(scores, window.reach)
+        scores = jnp.where(share > _INSIDE * n**2, product / jnp.sqrt(energy + _NOISE * n**2), _OUTSIDE)
+        move, score, curvature = _peak(scores, window.reach, strict)
+        score = jnp.where(own_share > _INSIDE, score, 0)
         return expected + jnp.einsum("pab,pb->pa", warp, move) / side, score, curvature
 
     return jax.lax.map(of_pair, (own, other, expected, warp))
 
 
 def _peak(
-    scores: Float[Array, "N N P"], reach: int
+    scores: Float[Array, "N N P"], reach: int, strict: bool
 ) -> tuple[Float[Array, "P 2"], Float[Array, " P"], Float[Array, " P"]]:
     """Return the shift x, y of the best score by a parabola through the nine around it, the score and its curvature."""
     last, at = 2 * reach, jnp.arange(scores.shape[2])
@@ -126,6 +141,9 @@ def _peak(
     row, column = best // (last + 1), best % (last + 1)
     at_rim = (row == 0) | (row == last) | (column == 0) | (column == last)
     row, column = jnp.clip(row, 1, last - 1), jnp.clip(column, 1, last - 1)
+    if strict:  # a parabola through a shift that leaves the picture is moved
+        around = [scores[row + down, column + right, at] for down in (-1, 0, 1) for right in (-1, 0, 1)]
+        at_rim |= jnp.min(jnp.stack(around), axis=0) <= _OUTSIDE
 
     def near(down: int, right: int) -> Array:
         return scores[row + down, column + right, at]
@@ -141,6 +159,12 @@ def _peak(
     flattest = -(xx + yy) / 2 - jnp.sqrt(((xx - yy) / 2) ** 2 + xy**2)
     move = jnp.stack([column, row], axis=-1) - reach + jnp.clip(newton, -_MOST_MOVE, _MOST_MOVE)
     return move, jnp.where(at_rim, 0, score), jnp.where(is_peak, flattest, 0)
+
+
+def _is_in(places: Float[Array, "*N 2"], box: Float[Array, " 4"]) -> Bool[Array, "*N"]:
+    """Return whether places x, y lie in a box of left, top, right and bottom."""
+    low, high = (corner.reshape((1,) * (places.ndim - 1) + (2,)) for corner in (box[:2], box[2:]))
+    return jnp.all((places >= low) & (places <= high), axis=-1)
 
 
 def _offsets(reach: int) -> Float32[np.ndarray, "K 2"]:

@@ -63,13 +63,21 @@ def blend_frame(views: Sequence[WindowView]) -> BlendedFrame:
 
     return BlendedFrame(
         depth=depth.astype(np.float32),
-        depth_confidence=(confidence * shares).sum(axis=0).astype(np.float32),
+        depth_confidence=_mean_confidence(confidence, valid, shares).astype(np.float32),
         saliency=of_patches("saliency"),
         motion=of_patches("motion"),
         dynamic_mask=(said * shares).sum(axis=0) >= 0.5,
         camera_from_world=blend_cameras(views),
         intrinsics=np.einsum("v,vij->ij", weights, [view.result.intrinsics[view.number] for view in views]),
     )
+
+
+def _mean_confidence(
+    confidence: Float64[np.ndarray, "V H W"], valid: Bool[np.ndarray, "V H W"], shares: Float64[np.ndarray, "V 1 1"]
+) -> Float64[np.ndarray, "H W"]:
+    """Return the mean of the views whose pixel is valid; of all where none is."""
+    used = valid | ~valid.any(axis=0)
+    return (np.where(used, confidence, 0) * shares).sum(axis=0) / (used * shares).sum(axis=0)
 
 
 def blend_cameras(views: Sequence[WindowView]) -> Float64[np.ndarray, "3 4"]:

@@ -156,7 +156,7 @@ class Growth:
         self._worlds = solve_graph(len(self.nodes), edges, reaches)
         old, times = self.nodes[0], _times(self.nodes[0], self.clip)
         settings = old.settings if times is not None else _without(old.settings, _TIMES)
-        settings |= self._masks()
+        settings = settings | self._masks()  # that of the old result stays as it is
         earlier = settings.get("extended")
         windows = [self._facts(number, reaches[0]) for number in self._in_order()]
         facts = {"clip": self.clip.source.name, "first": len(old.depth), "frames": len(self.clip), "windows": windows}

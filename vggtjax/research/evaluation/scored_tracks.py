@@ -49,7 +49,7 @@ def track_metrics(result: Result, truth: TruthAtPixels, *, dense: bool) -> dict[
         found = positions[:, own].astype(np.float64)
         found_visible = result.track_visibility[:, own] >= SEEN
     lifted = _lifted(result, found)
-    known = np.isfinite(lifted).all(axis=2)
+    known = np.asarray(np.isfinite(lifted).all(axis=2))
     visible, found_visible = visible & known, found_visible & known
     in_camera = _moved(cameras, points)
     to_first = np.broadcast_to(cameras[0], cameras.shape)
@@ -57,7 +57,7 @@ def track_metrics(result: Result, truth: TruthAtPixels, *, dense: bool) -> dict[
     worlds = _moved(world_from_camera(poses[:1])[:, :3], _moved(poses, lifted)), _moved(to_first, points)
     height, width = result.source_size[0]
     focal = np.sqrt(np.prod(sequence.intrinsics[0][[0, 1], [0, 1]])) * _SIDE / min(height, width)
-    scores = tapvid3d_scores(lifted, in_camera, found_visible, visible, float(focal))
+    scores = tapvid3d_scores(lifted, in_camera, found_visible, visible, float(focal), known)
     kind = "dense" if dense else "tracks"
     metrics = {f"{kind}_apd": scores.apd} | ({} if dense else {"tracks_aj": scores.aj, "tracks_oa": scores.oa})
     scaled, moved = (world_track_errors(*worlds, visible, align) for align in get_args(TrackAlign))

@@ -37,6 +37,7 @@ def tapvid3d_scores(
     predicted_visible: Bool[np.ndarray, "S N"],
     visible: Bool[np.ndarray, "S N"],
     focal: float,
+    counted: Bool[np.ndarray, "S N"] | None = None,
 ) -> Tapvid3dScores:
     """Return TAPVid-3D's scores (Koppula et al. 2024) after one scale, the ratio of median distances to the camera.
 
@@ -49,6 +50,8 @@ def tapvid3d_scores(
         predicted_visible: whether the method takes a point for visible.
         visible: whether it is.
         focal: sqrt(fx fy) of a picture whose shorter side has 256 pixels.
+        counted: whose visibility is scored, such as where the prediction is known; all by default. Others must be
+            invisible in both.
 
     Raises:
         InputError: different shapes, predictions that are not finite, or no point that is visible in both.
@@ -62,9 +65,8 @@ def tapvid3d_scores(
         shares.append(right.sum() / visible.sum())
         # A visible point that is predicted too far is missed and wrong: below, it counts twice, as in the public code.
         jaccards.append((right & predicted_visible).sum() / (visible.sum() + (predicted_visible & ~right).sum()))
-    return Tapvid3dScores(
-        float(np.mean(shares)), float(np.mean(jaccards)), float((visible == predicted_visible).mean())
-    )
+    right_visible = (visible == predicted_visible)[... if counted is None else counted]
+    return Tapvid3dScores(float(np.mean(shares)), float(np.mean(jaccards)), float(right_visible.mean()))
 
 
 def world_track_errors(
