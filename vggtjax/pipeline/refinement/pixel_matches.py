@@ -66,8 +66,8 @@ def match_pixels(
         grid: rows and columns of patches.
         window: sizes.
         shown: left, top, right and bottom of the pictures within their padding, in patches; infinite without.
-        strict: leave out matches beside shifts that leave the picture: they are off by up to a pixel. An adjustment with
-            a robust loss gains by them.
+        strict: leave out matches beside shifts that leave the picture: they are off by up to a pixel. An adjustment
+            with a robust loss gains by them.
     """
     pairs = frame_pairs(len(pictures))
     own, offset = np.nonzero(pairs.exist)
