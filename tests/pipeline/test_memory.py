@@ -135,18 +135,18 @@ def test_free_memory_is_the_least_of_the_host_and_the_control_groups(tmp_path):
     assert room() is None
     write("proc/meminfo", "MemTotal: 2000 kB\nMemAvailable: 1000 kB\n")
     write("proc/self/status", "Name: python\nVmRSS: 100 kB\n")
-    assert room() == (1100, "of the computer", False)
+    assert room() == (1100, "in the computer", False)
     write("proc/self/cgroup", "4:memory:/a/b\n0::/c/d\n")
     write("sys/fs/cgroup/memory/a/memory.limit_in_bytes", f"{900 * 1024}")
     write("sys/fs/cgroup/memory/a/memory.usage_in_bytes", f"{200 * 1024}")
     write("sys/fs/cgroup/memory/a/memory.stat", f"total_inactive_file {50 * 1024}\n")
     write("sys/fs/cgroup/memory/memory.limit_in_bytes", "9223372036854771712")
     write("sys/fs/cgroup/memory/memory.usage_in_bytes", "5")
-    assert room() == (100 + 750, "of its container (cgroup)", True)
+    assert room() == (100 + 750, "in its container (cgroup)", True)
     write("sys/fs/cgroup/c/memory.max", f"{300 * 1024}")
     write("sys/fs/cgroup/c/memory.current", f"{100 * 1024}")
     write("sys/fs/cgroup/c/d/memory.max", "max")
-    assert room() == (100 + 200, "of its container (cgroup)", True)
+    assert room() == (100 + 200, "in its container (cgroup)", True)
     write("proc/self/status", "Name: python\nVmSize: 700000 kB\nVmData: 300 kB\nVmRSS: 100 kB\n")
     title = "Limit                     Soft Limit           Hard Limit           Units\n"
     data = f"Max data size             {2**40}        unlimited            bytes\n"
@@ -155,7 +155,7 @@ def test_free_memory_is_the_least_of_the_host_and_the_control_groups(tmp_path):
     address = (700000 + 400150) * 1024
     assert own_limits(tmp_path) == [("ulimit -d", 2**40, 300 * 1024), ("ulimit -v", address, 700000 * 1024)]
     stacks = 300_000_000 / 1024  # of threads that start later
-    assert room() == (100 + 200, "of its container (cgroup)", True)
+    assert room() == (100 + 200, "in its container (cgroup)", True)
     write("sys/fs/cgroup/c/memory.max", "max")
     write("sys/fs/cgroup/memory/a/memory.limit_in_bytes", "9223372036854771712")
     write("proc/meminfo", "MemTotal: 2000000 kB\nMemAvailable: 1000000 kB\n")
