@@ -39,7 +39,6 @@ def file_facts(path: Path) -> FileFacts | None:
 @lru_cache(maxsize=64)
 def content_digest(facts: FileFacts) -> str:
     """Return the sha256 of a file, computed once and kept: hashing 5 GB takes seconds."""
-
     from vggtjax.storage.kept_text import kept_text  # which imports jax
 
     def digest() -> str:

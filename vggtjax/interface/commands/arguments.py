@@ -10,15 +10,24 @@ import tyro
 from vggtjax.clips.preprocessing import Framing
 from vggtjax.interface.commands.flags import InWords, Switch, in_group, option
 from vggtjax.options import Options
+from vggtjax.storage.trajectories import Quaternion
 
 _SOURCES = tyro.conf.arg(metavar="SOURCE [SOURCE ...]", help_behavior_hint="(required)")
 
 Sources = Annotated[tuple[str, ...], tyro.conf.Positional, _SOURCES]
 ResultPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULT")]
 ModelName = Annotated[str | None, tyro.conf.arg(metavar="MODEL", help_behavior_hint="(required)")]
-Revision = Annotated[str | None, tyro.conf.arg(metavar="COMMIT", help_behavior_hint="")]
 Size = Annotated[Framing, tyro.conf.arg(name="input", help="")]
 Method = Annotated[Options, tyro.conf.arg(name="method", help="")]
+
+_COMMIT = "commit of a hub id, 40 hexadecimal digits; by default the one that was newest at the first use"
+Revision = Annotated[str | None, tyro.conf.arg(metavar="COMMIT", help=_COMMIT, help_behavior_hint="")]
+
+_ORDER = (
+    "order of the quaternions in pred_traj.txt, required for vggt4d, monst3r, easi3r, das3r and pomato:\n"
+    "wxyz as these programs write it, or xyzw; not for other formats"
+)
+QuaternionOrder = Annotated[Quaternion | None, tyro.conf.arg(help=_ORDER, help_behavior_hint="")]
 
 _REPLACE = "replace the file if it exists; never the source, or a part of a result"
 Overwrite = Annotated[tyro.conf.FlagCreatePairsOff[bool], tyro.conf.arg(help=_REPLACE, help_behavior_hint="")]

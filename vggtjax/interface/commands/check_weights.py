@@ -46,7 +46,7 @@ def check_weights(
         frames: number of frames of the embedded clip, at the model's own size.
         tolerance: most that an output may differ from the public code's, in standard deviations of its array; tracks
             may differ by 2e-3 pixels, their visibility and confidence by 2e-4.
-        revision: commit of a hub id, 40 hexadecimal digits; by default the one that was newest at the first use.
+        revision: commit of a hub id.
         config: JSON file with the configuration; that of the published model by default.
         out: folder for the table, as check-weights.md; by default it is only printed.
         overwrite: replace the file if it exists.

@@ -30,7 +30,7 @@ def convert(
     Args:
         source: a .safetensors file, a sharded one (its index or folder), a .pt or .pth file, or a hub id.
         destination: the .safetensors file to write.
-        revision: commit of a hub id, 40 hexadecimal digits; by default the one that was newest at the first use.
+        revision: commit of a hub id.
         config: JSON file with the configuration; that of the published model by default.
         heads: heads to convert, such as camera,depth; by default all heads of the model: camera,depth,points,tracks of
             VGGT, camera,depth,rays of Depth Anything 3.

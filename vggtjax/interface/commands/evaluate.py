@@ -13,7 +13,7 @@ from vggtjax.clips.captures.files import folder_name
 from vggtjax.clips.media.sampling import Sampling
 from vggtjax.clips.preprocessing import Framing
 from vggtjax.errors import InputError, one_line
-from vggtjax.interface.commands.arguments import EvaluationFolder, Size
+from vggtjax.interface.commands.arguments import EvaluationFolder, QuaternionOrder, Size
 from vggtjax.interface.commands.flags import InWords
 from vggtjax.interface.commands.models import ModelFiles
 from vggtjax.interface.commands.report import Report
@@ -89,13 +89,12 @@ class Folders:
         results: score results in these folders instead, each with a folder per sequence; no model is run. FORMAT is the
             program that wrote a folder, as of --format
         format: the program whose files the folders of --results have that name none; vggtjax by default
-        quaternion: order of the quaternions in pred_traj.txt, required for vggt4d, monst3r, easi3r, das3r and pomato:
-            wxyz as these programs write it, or xyzw; not for other formats
+        quaternion: order of the quaternions in pred_traj.txt
     """
 
     results: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=[FORMAT:]FOLDER ...", help_behavior_hint="")] = ()
     format: InWords[ReadFormat | None] = None
-    quaternion: InWords[Literal["xyzw", "wxyz"] | None] = None
+    quaternion: QuaternionOrder = None
 
     def check(self, candidates: Candidates) -> None:
         """Raise InputError for folders beside a model, and for words about folders without any."""

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
-from vggtjax.interface.commands.flags import InWords
+from vggtjax.interface.commands.arguments import QuaternionOrder
 from vggtjax.interface.commands.report import Report
 from vggtjax.results.saving import ForeignFormat, Saving
 
@@ -18,7 +18,7 @@ def import_result(
     out: Path,
     *,
     format: ForeignFormat,
-    quaternion: InWords[Literal["xyzw", "wxyz"] | None] = None,
+    quaternion: QuaternionOrder = None,
     confidence_percentile: float = 20.0,
 ) -> None:
     """Read the result folder of another project, and write it as ours: pictures, clouds, a scene to look at.
@@ -27,8 +27,7 @@ def import_result(
         source: the folder.
         out: folder for our files; an earlier result in it is replaced.
         format: the program whose files the folder has.
-        quaternion: order of the quaternions in pred_traj.txt, required for vggt4d, monst3r, easi3r, das3r and pomato:
-            wxyz as these programs write it, or xyzw; not for other formats.
+        quaternion: order of the quaternions in pred_traj.txt.
         confidence_percentile: leave out this percentage of the pixels, those of the lowest confidence, from the point
             clouds; at least 0 and less than 100.
     """

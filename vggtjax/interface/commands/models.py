@@ -63,7 +63,7 @@ class ModelFiles:
             demonstration model, which is not for real footage
         config: JSON file with the configuration of a PyTorch checkpoint; not needed for published weights (VGGT-1B,
             Depth Anything 3)
-        revision: commit of a hub id, 40 hexadecimal digits; by default the one that was newest at the first use
+        revision: commit of a hub id
         fusion: file of a fitted rule of fusion, as vggtjax fit-fusion writes it; the paper's rule by default
     """
 

@@ -9,8 +9,7 @@ from typing import Annotated, Literal
 import tyro
 
 from vggtjax.errors import InputError, OutputError
-from vggtjax.interface.commands.arguments import Overwrite, ResultPath
-from vggtjax.interface.commands.flags import InWords
+from vggtjax.interface.commands.arguments import Overwrite, QuaternionOrder, ResultPath
 from vggtjax.interface.commands.report import Report
 from vggtjax.results.saving import ReadFormat
 from vggtjax.storage.writing import check_file
@@ -29,7 +28,7 @@ def render(
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILM", help_behavior_hint="")] = None,
     overwrite: Overwrite = False,
     format: ReadFormat = "vggtjax",
-    quaternion: InWords[Literal["xyzw", "wxyz"] | None] = None,
+    quaternion: QuaternionOrder = None,
 ) -> None:
     """Draw a result's points as a film: the static background stays, what moves plays.
 
@@ -43,8 +42,7 @@ def render(
             a folder preview; the default file is replaced without --overwrite.
         overwrite: replace the file if it exists.
         format: the program whose files the folder has.
-        quaternion: order of the quaternions in pred_traj.txt, required for vggt4d, monst3r, easi3r, das3r and pomato:
-            wxyz as these programs write it, or xyzw; not for other formats.
+        quaternion: order of the quaternions in pred_traj.txt.
     """
     sides = _sides(size)
     report = Report()

@@ -12,12 +12,12 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from vggtjax.errors import InputError, VggtjaxError
-from vggtjax.interface.commands.arguments import Overwrite
+from vggtjax.interface.commands.arguments import Overwrite, QuaternionOrder
 from vggtjax.interface.commands.flags import InWords, Switch
 from vggtjax.interface.commands.report import Report
 from vggtjax.results.saving import ReadFormat
@@ -56,7 +56,7 @@ def view(
     export: InWords[Path | None] = None,
     overwrite: Overwrite = False,
     format: ReadFormat = "vggtjax",
-    quaternion: InWords[Literal["xyzw", "wxyz"] | None] = None,
+    quaternion: QuaternionOrder = None,
     serving: Annotated[Serving, tyro.conf.arg(name="server")] = Serving(),
 ) -> None:
     """See results in a browser: play them, turn them, compare them; or write them as one file that opens offline.
@@ -67,8 +67,7 @@ def view(
             viewer is served.
         overwrite: replace the file if it exists.
         format: the program whose files the folders have.
-        quaternion: order of the quaternions in pred_traj.txt, required for vggt4d, monst3r, easi3r, das3r and pomato:
-            wxyz as these programs write it, or xyzw; not for other formats.
+        quaternion: order of the quaternions in pred_traj.txt.
         serving: where the viewer is served
     """
     if not results:
