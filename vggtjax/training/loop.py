@@ -117,14 +117,12 @@ def train(
     labels = labels_of(recipe, init, GENERATED_NOTE if task is None else "")
     params = adapted(init, recipe) if isinstance(init, Model) else init
     options, task = options or RunOptions(), task or Task()
-    with locked_folder(out, "checkpoints and a model"):
+    clips = options.clips or Path(out) / "clips"
+    with locked_folder(out, "checkpoints and a model"), opened_worlds(recipe, clips, options.renderers) as worlds:
         run = Run(recipe, Path(out), task.init_probes(recipe.seed, recipe.model), params, labels, options)
         pace = _Pace(run, progress)
         pace.report()
-        with (
-            _signals() as received,
-            opened_worlds(recipe, options.clips or Path(out) / "clips", options.renderers) as worlds,
-        ):
+        with _signals() as received:
             trainer = _Trainer(run, task, worlds)
             while run.step < recipe.total_steps:
                 trainer.step()

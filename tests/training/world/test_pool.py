@@ -153,6 +153,7 @@ def test_recipes_that_cannot_be_drawn_are_refused(folder, tmp_path):
     missing = dataclasses.replace(recipe_of(folder), assets=str(tmp_path / "nowhere"))
     with pytest.raises(InputError, match="is not a folder"):
         train(missing, tmp_path / "out", task=Task(jnp.float32(1), make_batch, init_probes, objective, world_images))
+    assert not (tmp_path / "out" / "recipe.json").exists()
 
 
 def test_renderers_do_not_import_jax():
